@@ -73,22 +73,21 @@ def test_modules_import_only_what_their_layer_may(trees):
     assert wrong == []
 
 
-def test_no_two_classes_share_a_name(trees):
+def test_no_two_classes_share_a_name_and_no_two_modules_import_one_another(trees):
     names = Counter(node.name for tree in trees.values() for node in tree.body if isinstance(node, ast.ClassDef))
     assert [name for name, count in names.items() if count > 1] == []
-
-
-def test_no_two_modules_import_one_another(trees):
     names = {path: tuple(path.removesuffix(".py").split("/")) for path in trees}
     parts = {name[:-1] if name[-1] == "__init__" else name: trees[path] for path, name in names.items()}
     known = {name: {target if target in parts else target[:-1] for target in own(tree)} for name, tree in parts.items()}
     assert [(a, b) for a in parts for b in known[a] - {a} if a in known.get(b, ())] == []
 
 
-def test_the_vendors_sdk_is_known_to_one_file_and_to_the_bench_that_measures_it(trees):
+def test_the_vendors_sdk_is_known_to_one_file_and_the_bench_and_python_keeps_out_of_the_data_folders(trees):
     assert {
         path for path, tree in trees.items() if "dynamixel_sdk" in {name.split(".")[0] for name in imported(tree)}
     } == SDK_FILES
+    for folder in ("configs", "firmware_maps", "sim"):
+        assert not list((PACKAGE.parent / folder).rglob("*.py"))
 
 
 def test_help_loads_neither_torch_nor_numpy_nor_a_serial_port():
@@ -101,8 +100,3 @@ def test_help_loads_neither_torch_nor_numpy_nor_a_serial_port():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-
-
-def test_python_keeps_out_of_the_data_folders():
-    for folder in ("configs", "firmware_maps", "sim"):
-        assert not list((PACKAGE.parent / folder).rglob("*.py"))

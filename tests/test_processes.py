@@ -13,31 +13,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import sfms_robot
+from sfms_robot import processes
 from sfms_robot.emulator.launch import PROMPT_DEADLINE_S, READ_DEADLINE_S, EmulatedServo, launch
-from sfms_robot.processes import (
-    LIMITS,
-    ONE_THREAD,
-    Child,
-    Ended,
-    ParentPipe,
-    PipeWriter,
-    Supervised,
-    give_way,
-    process_pool,
-    realtime_priority,
-)
 
 CLOSE_S = 0.2
 LARGE = 1_000_000  # bytes: more than any pipe takes
-LOOSE = {name: "7" for name in ONE_THREAD}  # BLAS and OpenMP read them when they are loaded
+LOOSE = {name: "7" for name in processes.ONE_THREAD}  # BLAS and OpenMP read them when they are loaded
 
 
 # --- one end of a pipe ------------------------------------------------------------------------------------------------
-
-
 def writer_and_reader(kept=1):
     reading, writing = os.pipe()
-    return PipeWriter(os.fdopen(writing, "wb"), kept, "test"), os.fdopen(reading, "rb")
+    return processes.PipeWriter(os.fdopen(writing, "wb"), kept, "test"), os.fdopen(reading, "rb")
 
 
 def test_sent_messages_come_whole_and_in_order_before_those_that_were_offered():
@@ -88,37 +75,35 @@ def test_a_reader_that_has_ended_costs_nothing():
 
 
 # --- a real child -----------------------------------------------------------------------------------------------------
-
-
 def threads(task=0):
     """Return the thread settings of this process, and the threads that torch uses."""
     import torch
 
-    return {name: os.environ.get(name) for name in ONE_THREAD}, torch.get_num_threads()
+    return {name: os.environ.get(name) for name in processes.ONE_THREAD}, torch.get_num_threads()
 
 
 def tells_of_itself():
-    parent = ParentPipe()
+    parent = processes.ParentPipe()
     os.write(1, b"a library prints")
-    give_way(3)
+    processes.give_way(3)
     parent.send((threads(), signal.getsignal(signal.SIGINT) is signal.SIG_IGN, os.nice(0)))
 
 
 def echoes():
-    parent = ParentPipe()
+    parent = processes.ParentPipe()
     while True:
         parent.send(parent.receive())
 
 
 def waits():
-    parent = ParentPipe()
+    parent = processes.ParentPipe()
     parent.forward(lambda _: None)
     parent.send("ready")
     threading.Event().wait()
 
 
 def counts():
-    parent = ParentPipe()
+    parent = processes.ParentPipe()
     for number in range(50):
         parent.send(None)
         parent.send(number)
@@ -131,7 +116,7 @@ def start(monkeypatch):
     children = []
 
     def started(function, *first, **how):
-        children.append(Child(f"{__name__}:{function.__name__}", *first, name="test", **how))
+        children.append(processes.Child(f"{__name__}:{function.__name__}", *first, name="test", **how))
         return children[-1]
 
     yield started
@@ -144,8 +129,8 @@ def test_a_child_computes_with_one_thread_ignores_ctrl_c_and_its_prints_stay_out
     for name, value in LOOSE.items():
         monkeypatch.setenv(name, value)
     child = start(tells_of_itself, quiet=True)
-    assert child.receive(60.0) == ((ONE_THREAD, 1), True, os.nice(0) + 3)
-    assert child.receive(60.0) == Ended(0)
+    assert child.receive(60.0) == ((processes.ONE_THREAD, 1), True, os.nice(0) + 3)
+    assert child.receive(60.0) == processes.Ended(0)
 
 
 def test_messages_are_answered_and_the_last_one_is_the_exit_code(start):
@@ -154,20 +139,20 @@ def test_messages_are_answered_and_the_last_one_is_the_exit_code(start):
     assert [child.receive(60.0) for _ in range(2)] == ["first", {"second": 2}]
     assert child.gave_sign() and not child.gave_sign() and child.receive() is None
     child.process.kill()
-    assert child.receive(60.0) == Ended(-signal.SIGKILL)
+    assert child.receive(60.0) == processes.Ended(-signal.SIGKILL)
 
 
 def test_messages_that_are_not_fetched_are_dropped_oldest_first_and_signs_of_life_are_no_messages(start):
     came = []
     start(counts, take=came.append).reader.join()
-    assert came == [*range(50), Ended(0)]
+    assert came == [*range(50), processes.Ended(0)]
     child = start(counts, most=10)
     child.reader.join()
-    assert [child.receive() for _ in range(10)] == [*range(41, 50), Ended(0)]
+    assert [child.receive() for _ in range(10)] == [*range(41, 50), processes.Ended(0)]
     assert child.dropped == 50 + 1 - 10 and child.receive() is None
 
 
-@pytest.mark.parametrize("end", [lambda child: child.close(CLOSE_S), Child.kill])
+@pytest.mark.parametrize("end", [lambda child: child.close(CLOSE_S), processes.Child.kill])
 def test_a_child_that_is_stopped_holds_nothing_up_and_leaves_no_file_open(start, end):
     child = start(waits)
     assert child.receive(60.0) == "ready"
@@ -213,8 +198,6 @@ def test_a_child_whose_parent_ends_before_its_first_message_ends_without_a_word(
 
 
 # --- supervision, in virtual time -------------------------------------------------------------------------------------
-
-
 class Fake:
     """A child that only knows whether it was killed."""
 
@@ -229,7 +212,7 @@ class Watched:
 
     def __init__(self, limits, phase="starting"):
         self.children, self.now_s, self.refusals = [], 0.0, 0
-        self.supervised = Supervised("test", limits, self._start)
+        self.supervised = processes.Supervised("test", limits, self._start)
         if phase != "starting":
             self.supervised.enter(phase)
         self.supervised.check(0.0, True)
@@ -252,12 +235,12 @@ class Watched:
         return self.now_s - began_s
 
 
-PHASES = [(name, phase) for name, limits in LIMITS.items() for phase in limits.silent_s]
+PHASES = [(name, phase) for name, limits in processes.LIMITS.items() for phase in limits.silent_s]
 
 
 @pytest.mark.parametrize(("name", "phase"), PHASES)
 def test_a_child_without_a_sign_of_life_is_killed_and_started_again_after_the_limit_of_its_phase(name, phase):
-    limits = LIMITS[name]
+    limits = processes.LIMITS[name]
     watched = Watched(limits, phase)
     restarted_s = watched.until(lambda child: child.restarts)
     assert restarted_s == pytest.approx(limits.silent_s[phase] + limits.pause_s, abs=0.25)
@@ -270,9 +253,9 @@ def test_a_child_without_a_sign_of_life_is_killed_and_started_again_after_the_li
 @pytest.mark.parametrize(("name", "phase"), [("listener", "starting"), ("listener", "loading"), ("page", "running")])
 def test_a_child_that_hangs_is_named_once_and_once_when_it_answers_again(name, phase, caplog):
     caplog.set_level(logging.INFO)
-    watched = Watched(LIMITS[name], phase)
+    watched = Watched(processes.LIMITS[name], phase)
     hung_s = watched.until(lambda child: child.hung)
-    assert hung_s == pytest.approx(LIMITS[name].hung_s, abs=0.126) and watched.supervised.away
+    assert hung_s == pytest.approx(processes.LIMITS[name].hung_s, abs=0.126) and watched.supervised.away
     watched.supervised.check(watched.now_s + 0.125, False)
     watched.supervised.check(watched.now_s + 0.25, True)
     assert not watched.supervised.hung and watched.supervised.hangs == 1
@@ -283,7 +266,7 @@ def test_a_child_that_hangs_is_named_once_and_once_when_it_answers_again(name, p
 
 
 def test_a_child_that_works_for_ever_and_gets_nowhere_is_started_again():
-    limits = LIMITS["listener"]
+    limits = processes.LIMITS["listener"]
     assert Watched(limits, "loading").until(lambda child: child.restarts, alive=True) == pytest.approx(60.0, abs=0.25)
     assert Watched(limits, "running").until(lambda child: child.restarts, alive=True) is None
     waiting = Watched(limits, "loading")
@@ -296,7 +279,7 @@ def test_a_child_that_works_for_ever_and_gets_nowhere_is_started_again():
 
 def test_pauses_double_and_begin_again_after_steady_running_and_failures_in_a_row_are_logged_once(caplog):
     caplog.set_level(logging.INFO)
-    limits = LIMITS["source"]
+    limits = processes.LIMITS["source"]
     watched, paused_s = Watched(limits), []
     for _ in range(2000):  # days without a camera
         watched.supervised.fail("gone")
@@ -310,7 +293,7 @@ def test_pauses_double_and_begin_again_after_steady_running_and_failures_in_a_ro
 
 
 def test_a_process_that_cannot_be_started_counts_as_another_failure():
-    watched = Watched(LIMITS["source"])
+    watched = Watched(processes.LIMITS["source"])
     watched.refusals = 2
     watched.supervised.fail("gone")
     assert watched.until(lambda child: child.phase == "starting") == 0.5 + 1.0 + 2.0
@@ -319,7 +302,7 @@ def test_a_process_that_cannot_be_started_counts_as_another_failure():
 
 @given(st.lists(st.integers(0, 30), max_size=60))
 def test_at_most_five_restarts_happen_in_a_minute_and_the_next_failure_is_the_last(gaps_s):
-    watched, failed_s = Watched(LIMITS["listener"]), []
+    watched, failed_s = Watched(processes.LIMITS["listener"]), []
     for gap_s in gaps_s:
         watched.now_s += gap_s
         watched.supervised.phase_s = 0.0
@@ -333,7 +316,7 @@ def test_at_most_five_restarts_happen_in_a_minute_and_the_next_failure_is_the_la
 
 
 def test_a_page_is_not_started_again_and_a_break_of_the_run_itself_is_no_silence(caplog):
-    watched = Watched(LIMITS["page"], "running")
+    watched = Watched(processes.LIMITS["page"], "running")
     watched.supervised.check(3600.0, False)
     watched.supervised.check(0.0, False)  # another run begins
     assert not watched.supervised.hung and not caplog.records
@@ -343,16 +326,14 @@ def test_a_page_is_not_started_again_and_a_break_of_the_run_itself_is_no_silence
 
 
 # --- pools and priority -----------------------------------------------------------------------------------------------
-
-
 def test_a_process_of_a_pool_computes_with_one_thread(monkeypatch):
     for name, value in LOOSE.items():
         monkeypatch.setenv(name, value)
-    with process_pool(1) as pool:
-        assert pool.submit(threads).result() == (ONE_THREAD, 1)
+    with processes.process_pool(1) as pool:
+        assert pool.submit(threads).result() == (processes.ONE_THREAD, 1)
     assert {name: os.environ[name] for name in LOOSE} == LOOSE
     monkeypatch.undo()
-    assert threads() == (ONE_THREAD, 1)  # nor do workers of pytest use more (conftest.py)
+    assert threads() == (processes.ONE_THREAD, 1)  # nor do workers of pytest use more (conftest.py)
 
 
 def test_every_pool_and_every_pickling_child_of_the_package_is_made_in_one_place():
@@ -365,18 +346,18 @@ def test_every_pool_and_every_pickling_child_of_the_package_is_made_in_one_place
 @pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="no real-time priority here")
 def test_priority_is_granted_or_says_why_not_and_is_not_inherited():
     code = "import os; print(os.sched_getscheduler(0))"
-    with realtime_priority() as outcome:
+    with processes.realtime_priority() as outcome:
         assert outcome == "fifo" or outcome.startswith("refused: ")
         told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert int(told.stdout) == os.SCHED_OTHER
-    with realtime_priority(wanted=False) as outcome:
+    with processes.realtime_priority(wanted=False) as outcome:
         assert outcome == "not asked for"
 
 
 @pytest.mark.parametrize("virtual", [False, True])
 def test_an_emulated_chain_is_as_prompt_as_hardware_where_the_system_lets_it(virtual):
     """In virtual time it needs no priority; one that was refused is waited for longer."""
-    with launch([EmulatedServo(1)], virtual=virtual) as chain, realtime_priority(wanted=not virtual) as here:
+    with launch([EmulatedServo(1)], virtual=virtual) as chain, processes.realtime_priority(wanted=not virtual) as here:
         assert chain.priority == here
         assert chain.read_deadline_s == (PROMPT_DEADLINE_S if here == "fifo" else READ_DEADLINE_S)
         if here == "fifo":

@@ -29,11 +29,14 @@ def test_a_stream_is_the_pure_step_with_its_memory_kept(listener):
     assert plans == 3 and stream.time_s == pytest.approx(0.48)
 
 
-def test_two_streams_of_one_listener_know_nothing_of_one_another(listener):
+def test_two_streams_know_nothing_of_one_another_and_a_face_may_be_an_array_or_a_face_frame(listener):
     first, second = listener.stream(seed=1), listener.stream(seed=1)
     alone = first.push(np.zeros(640))
     listener.stream(seed=9).push(np.ones(640) * 0.1)
     assert np.array_equal(alone.frames, second.push(np.zeros(640)).frames)
+    motion = np.linspace(0, 0.1, 58, dtype=np.float32)
+    plans = [listener.stream().push(None, face=face) for face in (motion, sr.FaceFrame.of(99.0, motion))]
+    assert np.array_equal(plans[0].frames, plans[1].frames)
 
 
 WRONG = [
@@ -53,9 +56,3 @@ def test_what_is_no_frame_is_refused_and_the_stream_goes_on(listener, given, mes
         stream.push(**given)
     assert stream.time_s == 0.0
     assert np.array_equal(stream.push(None).frames, untouched.push(None).frames)
-
-
-def test_a_face_may_be_an_array_or_a_face_frame(listener):
-    motion = np.linspace(0, 0.1, 58, dtype=np.float32)
-    plans = [listener.stream().push(None, face=face) for face in (motion, sr.FaceFrame.of(99.0, motion))]
-    assert np.array_equal(plans[0].frames, plans[1].frames)

@@ -16,14 +16,11 @@ def test_every_public_name_is_there(name):
     assert name in dir(sfms_robot)
 
 
-def test_type_checkers_see_the_same_names():
+def test_type_checkers_see_the_same_names_and_an_unknown_one_is_an_attribute_error():
     tree = ast.parse(Path(sfms_robot.__file__).read_text(encoding="utf-8"))
     (guarded,) = [node for node in tree.body if isinstance(node, ast.If)]
     seen = {alias.asname or alias.name for node in guarded.body for alias in node.names}
     assert seen == set(sfms_robot.__all__)
-
-
-def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="has no attribute 'run_head'"):
         _ = sfms_robot.run_head
 

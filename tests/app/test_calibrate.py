@@ -264,8 +264,6 @@ def test_a_stored_value_that_stops_a_joint_names_the_command_with_the_arguments_
 
 
 # --- what a run makes of it -------------------------------------------------------------------------------------
-
-
 def ready_on(name: str, port: str) -> Head:
     kept: dict[str, Port] = {}
     ready = calibrated_head(name, port, RealClock(), kept)
@@ -327,8 +325,6 @@ def test_a_run_holds_a_joint_back_whose_servo_is_another(name, caplog):
 
 
 # --- what a start refuses, and `doctor --fix` records -----------------------------------------------------------
-
-
 @pytest.fixture
 def turret(tmp_path, monkeypatch) -> Path:
     """A copy of a shipped head, and a folder for what belongs to this build."""

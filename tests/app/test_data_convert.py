@@ -28,8 +28,6 @@ def matrix(folder):
 
 
 # --- laws -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["l2l", "lm_listener", "react2025", "dualtalk", "dualtalk_arkit", "dim", "seamless"])
 def test_every_convertible_set_becomes_one_that_listeners_are_trained_on(name, tmp_path):
     source = getattr(write, name)(tmp_path / "in")
@@ -75,8 +73,6 @@ def test_mel_of_30_fps_is_taken_at_the_same_instants(tmp_path):
 
 
 # --- what is lost -----------------------------------------------------------------------------------------------
-
-
 def test_without_a_matrix_flame_s_expression_is_all_lost_and_that_is_said(tmp_path):
     report = convert_data(write.dualtalk_demo(tmp_path / "in"), tmp_path / "out")
     assert report["residual"]["expression_lost_share"] == 1.0
@@ -150,8 +146,6 @@ def test_table_tells_splits_licence_and_residual(tmp_path, command_line):
 
 
 # --- bad input --------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("writer", "words", "said"),
     [

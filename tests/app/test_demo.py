@@ -97,15 +97,12 @@ def test_a_second_demo_writes_beside_the_first(tmp_path):
         (tmp_path / name).mkdir()
 
 
-def test_seeds_are_told_one_by_one():
+def test_seeds_are_told_one_by_one_with_the_mean_and_scatter_of_their_nods():
     seen = []
     told = compare_seeds(SHORT, 2, seen.append)
     assert [row["seed"] for row in seen] == [0, 1] and seen == told["runs"]
     assert (told["exit"], told["exit_code"]) == ("done", 0)
     assert told["nods"] == nods_over_seeds([row["nods"] for row in seen])
-
-
-def test_nods_of_several_seeds_have_a_mean_a_scatter_and_those_without():
     assert nods_over_seeds([4, 0, 8, 4]) == {"mean": 4.0, "variance_over_mean": 2.67, "seeds_without": 1}
     assert nods_over_seeds([0, 0])["variance_over_mean"] is None is nods_over_seeds([3])["variance_over_mean"]
 

@@ -81,8 +81,6 @@ def fix_of(report: dict, problem: str) -> str:
 
 
 # --- chains -----------------------------------------------------------------------------------------------------
-
-
 def test_a_sound_chain_is_fit_to_run_and_looking_changes_nothing():
     with patient() as sick:
         report = sick.examined()
@@ -292,17 +290,19 @@ def test_a_maestro_answers_where_its_crc_setting_is_that_of_the_heads_file(store
 
 
 # --- ports ------------------------------------------------------------------------------------------------------
-
-
 def no_port(path: str) -> dict:
     line = Line(device=path, shown=path, family="dynamixel2", baud=BAUD, rate_hz=100.0, wanted={})
     clock = RealClock()
     return examine_line(line, clock, lambda device, baud: SerialPort(device, baud, clock))
 
 
-def test_a_port_that_is_none_ends_in_three(tmp_path):
+def test_a_port_that_is_none_and_unknown_families_and_heads_end_it_at_once(tmp_path):
     assert no_port(str(tmp_path))["exit_code"] == 3 and "directory" in no_port(str(tmp_path))["findings"][0]["problem"]
     assert no_port(str(tmp_path / "x"))["exit_code"] == 3
+    with pytest.raises(ConfigError, match="dynamixel2"):
+        examine("/dev/null", None, "dynamixel9", None)
+    with pytest.raises(ConfigError, match="nobody"):
+        examine("sim", "nobody", None, None)
 
 
 def test_a_port_that_somebody_holds_ends_in_three():
@@ -316,8 +316,6 @@ def test_a_port_that_somebody_holds_ends_in_three():
 
 
 # --- what servos have stored ------------------------------------------------------------------------------------
-
-
 NARROW = {"min_position_limit": 1900, "max_position_limit": 2200}
 
 
@@ -349,24 +347,19 @@ def test_a_servo_turned_past_one_turn_is_brought_back_by_the_fix():
         assert told(sick.examined(), "error") == []
 
 
-def test_what_acts_by_itself_or_shifts_angles_is_told():
+def test_what_acts_by_itself_or_shifts_angles_is_told_and_without_a_head_left_alone():
     stored = {"startup_configuration": 1, "secondary_id": 2, "homing_offset": 100, "drive_mode": 1, "shutdown": 0}
     with patient(EmulatedServo(1, registers=stored), EmulatedServo(3), count=1) as sick:
         needing(sick, 1, JointNeeds(1462, 2634, other_ids=frozenset({2})))
         report = sick.examined()
     said = " ".join(told(report, "error") + told(report, "warning"))
     assert all(f"{name} is {value}" in said for name, value in stored.items())
-
-
-def test_without_a_head_an_offset_contradicts_nothing_and_is_left_alone():
     with patient(EmulatedServo(1, registers={"homing_offset": 100, "drive_mode": 1}), count=1) as sick:
         report = sick.examined(wanted={}, fix=lambda question: True)
     assert len(told(report, "warning")) == 2 and report["fixed"] == [] and report["exit_code"] == 0
 
 
 # --- the budget and the wording ---------------------------------------------------------------------------------
-
-
 def test_every_command_that_is_proposed_is_one_that_the_program_has():
     servos = [EmulatedServo(1, baud=57_600), EmulatedServo(2), EmulatedServo(4)]
     with patient(*servos, count=3) as sick:
@@ -380,13 +373,6 @@ def test_every_command_that_is_proposed_is_one_that_the_program_has():
         words = shlex.split(text.replace("OLD", "1").replace("NEW", "2"))
         group = root.commands[words[0]]
         group.commands[words[1]].make_context(words[1], words[2:], resilient_parsing=False)
-
-
-def test_a_doctor_is_not_asked_about_unknown_things():
-    with pytest.raises(ConfigError, match="dynamixel2"):
-        examine("/dev/null", None, "dynamixel9", None)
-    with pytest.raises(ConfigError, match="nobody"):
-        examine("sim", "nobody", None, None)
 
 
 @pytest.mark.parametrize("where", [{"port": "sim", "head": None}, {"port": "/dev/null", "head": "reachy_mini"}])

@@ -31,15 +31,12 @@ def test_servo_list_that_cannot_be_read_is_one_clear_line(text, message):
         parse_servos(text)
 
 
-def test_whole_head_is_plugged_in_bus_by_bus():
+def test_a_whole_head_is_plugged_in_bus_by_bus_and_faults_may_stand_in_a_file(tmp_path):
     with emulators(head="face28", voltage=6.0, faults=("silent:3",)) as chains:
         assert len(chains) == 1
         [chain] = chains.values()
         assert chain.faults() == ["silent:3"]
         assert chain.state(28)["torque"] is False and chain.state(28)["faults"] == ""
-
-
-def test_faults_may_stand_in_a_file(tmp_path):
     file = tmp_path / "bad_day.txt"
     file.write_text("# what broke\ndrop:1=0.5\n\nbrownout@3   # somebody trips over the cable\n")
     with emulators(servo="xl330-m288:1", faults=(str(file), "delay=0.001")) as chains:

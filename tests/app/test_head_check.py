@@ -33,7 +33,7 @@ def command(command_line):
     return lambda *words: command_line("head", *words)[:2]
 
 
-def test_use_and_demand_are_those_of_the_faces_shown(tracks):
+def test_use_and_demand_are_those_of_the_faces_shown_and_clipping_leaves_out_where_a_joint_rests(tracks):
     rows = {row["joint"]: row for row in check("face28", tracks)["joints"]}
     pitch, jaw = rows["neck_pitch"], rows["jaw"]
     assert (pitch["low_deg"], pitch["high_deg"]) == pytest.approx((-10, 10), abs=0.1)
@@ -43,9 +43,6 @@ def test_use_and_demand_are_those_of_the_faces_shown(tracks):
     assert 1 < pitch["jerk"] / ((2 * np.pi) ** 3 * 10 / limit.jerk_deg_s3) < 1.5  # frames make it a little rougher
     assert jaw["high_deg"] == pytest.approx(14, abs=0.1) and jaw["clipped"] == 0
     assert (pitch["channels"], jaw["channels"]) == (("pitch",), ["jawOpen"])
-
-
-def test_clipping_counts_ends_of_the_range_but_not_where_the_joint_rests(tracks):
     rows = {row["joint"]: row for row in check("inmoov2_maestro", tracks)["joints"]}
     assert rows["jaw"]["low_deg"] == 0 and rows["jaw"]["clipped"] == 0
 
@@ -78,15 +75,12 @@ def test_all_problems_come_at_once_with_those_of_the_neck(tmp_path, command):
     assert code == 2 and len(json.loads(out)["problems"]) == 4
 
 
-def test_a_neck_whose_home_is_out_of_reach_is_a_problem_of_the_head(tmp_path):
+def test_a_folder_without_tracks_is_refused_and_a_home_out_of_reach_is_a_problem_of_the_head(tmp_path):
+    with pytest.raises(ConfigError, match="no face tracks"):
+        check("op3_head", tmp_path)
     text = (data_dir("configs") / "heads" / "reachy_mini" / "head.yaml").read_text()
     (tmp_path / "head.yaml").write_text(text.replace("home_height_m: 0.177", "home_height_m: 0.3"))
     assert "home is out of reach" in " ".join(check(str(tmp_path))["problems"])
-
-
-def test_a_folder_without_tracks_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="no face tracks"):
-        check("op3_head", tmp_path)
 
 
 def test_the_table_names_every_joint_and_what_is_lost_and_the_picture_is_small(tracks, tmp_path, command):

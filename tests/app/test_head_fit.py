@@ -5,16 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from sfms_robot.app.head.fit import (
-    Tracker,
-    babble,
-    fit_head,
-    hidden_skin,
-    random_faces,
-    read_pairs,
-    see_virtual_face,
-    skin_motion,
-)
+from sfms_robot.app.head import fit as fitting
 from sfms_robot.app.head.head_check import fidelity, named_faces
 from sfms_robot.app.options import HeadOptions
 from sfms_robot.app.replay.run_file import read_recording
@@ -42,8 +33,8 @@ def test_held_out_faces_come_three_times_nearer(seed, record_property):
     units, rng, joints = Units.of(head), np.random.default_rng(seed), len(head.joints)
     shapes = recorded_shapes()
     held_out = np.arange(len(shapes)) // 50 % 4 == 3
-    tracker = Tracker(head, hidden_skin(joints, seed))
-    ideal = Tracker(head)
+    tracker = fitting.Tracker(head, fitting.hidden_skin(joints, seed))
+    ideal = fitting.Tracker(head)
 
     train = asked(head, shapes[~held_out])
     responses = fit(train, looks_like(head, tracker.seen(train, rng)), units.low, units.high)
@@ -52,7 +43,7 @@ def test_held_out_faces_come_three_times_nearer(seed, record_property):
     fitted = head.model_copy(update={"joints": joints_fitted})
 
     test = shapes[held_out]
-    told, skin = asked(head, test), skin_motion()
+    told, skin = asked(head, test), fitting.skin_motion()
     best = ideal.face(told)
     errors = {}
     for name, candidate in (("before", head), ("after", fitted)):
@@ -69,7 +60,7 @@ def test_the_virtual_face_without_a_skin_of_its_own_looks_as_asked():
     head = load_head("face28")
     shapes = recorded_shapes()[::5]
     told = asked(head, shapes)
-    face = Tracker(head).face(told)
+    face = fitting.Tracker(head).face(told)
     assert face.min() >= 0 and face.max() <= 1
     assert rms(looks_like(head, face) - told) < 0.01
 
@@ -77,8 +68,8 @@ def test_the_virtual_face_without_a_skin_of_its_own_looks_as_asked():
 @pytest.fixture(scope="module")
 def babbled(tmp_path_factory):
     folder = tmp_path_factory.mktemp("babble")
-    report = babble(HeadOptions(head="inmoov2_maestro", fast=True), folder, minutes=0.1, seed=2)
-    see_virtual_face("inmoov2_maestro", folder)
+    report = fitting.babble(HeadOptions(head="inmoov2_maestro", fast=True), folder, minutes=0.1, seed=2)
+    fitting.see_virtual_face("inmoov2_maestro", folder)
     return folder, report
 
 
@@ -87,7 +78,7 @@ def test_babbling_keeps_to_the_limits_and_is_learnt_from(babbled, monkeypatch, t
     folder, report = babbled
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     assert report["limits"]["violations"] == 0 and report["exit"] == "done"
-    result = fit_head("inmoov2_maestro", folder)
+    result = fitting.fit_head("inmoov2_maestro", folder)
     assert result["after"] < result["before"]
     json.dumps(result)
     head = load_head("inmoov2_maestro")
@@ -103,13 +94,13 @@ def test_what_is_no_recording_of_this_face_is_told(babbled, tmp_path):
     (tmp_path / "run.mcap").write_bytes((folder / "run.mcap").read_bytes())
     run = read_recording(folder)
     with pytest.raises(ConfigError, match=r"has no face\.csv"):
-        read_pairs(head, tmp_path, run)
+        fitting.read_pairs(head, tmp_path, run)
     with pytest.raises(ConfigError, match="without joint"):
-        read_pairs(load_head("face28"), folder, run)
+        fitting.read_pairs(load_head("face28"), folder, run)
 
 
 def test_random_faces_begin_and_end_at_rest_and_stay_faces():
-    faces = random_faces([0, 5, 9], 30.0, seed=1)
+    faces = fitting.random_faces([0, 5, 9], 30.0, seed=1)
     times_s = np.arange(0, faces.duration_s, 0.01)
     motion, _ = faces.sample(times_s, 0.0, None)
     assert not motion[0].any() and np.abs(motion[-1]).max() < 0.01

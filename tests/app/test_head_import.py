@@ -105,13 +105,9 @@ def test_what_makes_no_head_is_one_line_and_writes_nothing(tmp_path, content, li
     assert line in str(refused.value) and "\n" not in str(refused.value) and not (tmp_path / "made").exists()
 
 
-def test_a_folder_that_exists_is_kept(tmp_path):
+def test_a_folder_that_exists_is_kept_and_one_that_cannot_be_made_names_the_option(tmp_path):
     (tmp_path / "file.json").write_text(json.dumps(LEROBOT))
     with pytest.raises(ConfigError, match="exists already"):
         import_head(tmp_path / "file.json", tmp_path)
-
-
-def test_a_folder_that_cannot_be_made_names_the_option(tmp_path):
-    (tmp_path / "file.json").write_text(json.dumps(LEROBOT))
     with pytest.raises(ConfigError, match="--to .*made: cannot be written to"):
         import_head(tmp_path / "file.json", tmp_path / "file.json" / "made")

@@ -23,14 +23,11 @@ def poses(tmp_path):
     return write
 
 
-def test_columns_may_stand_in_any_order_beside_others(poses):
+def test_columns_stand_in_any_order_and_a_body_yaw_is_that_of_its_column_or_of_the_heads_rule(poses):
     one = solve_poses("reachy_mini", poses(f"{HEADER}\n0.005,0,0,0,0.1,0.2\n"))
     other = solve_poses("reachy_mini", poses("name,yaw_rad,pitch_rad,roll_rad,z_m,y_m,x_m\nnod,0.2,0.1,0,0,0,0.005\n"))
     assert one["poses"] == other["poses"] and all(pose["reached"] for pose in one["poses"])
     assert one["joints"] == ["body_rotation", *(f"stewart_{leg}" for leg in range(1, 7))]
-
-
-def test_a_body_yaw_is_taken_from_its_column_and_else_by_the_heads_own_rule(poses):
     given = solve_poses("reachy_mini", poses(f"{HEADER},body_yaw_rad\n0,0,0,0,0,0.5,0.5\n"))
     ruled = solve_poses("reachy_mini", poses(f"{HEADER}\n0,0,0,0,0,0.5\n0,0,0,0,0,1.0\n"))
     assert given["poses"][0]["angles_rad"][0] == 0.5
@@ -44,7 +41,7 @@ def test_the_neck_of_the_face_takes_the_pose_as_it_is_but_no_shift(poses):
     assert [pose["reached"] for pose in table["poses"]] == [True, False]
 
 
-def test_the_command_prints_a_column_per_joint_in_rad_and_whether_it_got_there(poses, command_line):
+def test_the_command_prints_a_column_per_joint_in_rad_and_whether_it_got_there_and_so_does_json(poses, command_line):
     file = poses(f"{HEADER}\n0,0,0,0,0.2618,0\n0,0,0.1,0,0,0\n")
     ended = command_line("head", "solve", "reachy_mini", "--poses", file, "--residual")
     rows = list(csv.DictReader(ended.out.splitlines()))
@@ -53,10 +50,6 @@ def test_the_command_prints_a_column_per_joint_in_rad_and_whether_it_got_there(p
     assert list(rows[0]) == ["body_rotation", *legs, "reached", "residual_rad", "residual_m"]
     assert float(rows[0]["stewart_1"]) == pytest.approx(0.512924522559, abs=1e-6)
     assert float(rows[1]["residual_m"]) == pytest.approx(0.077, abs=1e-3)
-
-
-def test_json_has_what_the_table_has_and_what_is_missing(poses, command_line):
-    file = poses(f"{HEADER}\n0,0,0,0,0.2618,0\n0,0,0.1,0,0,0\n")
     ended = command_line("head", "solve", "reachy_mini", "--poses", file, "--json")
     assert ended.code == 0 and ended.told == solve_poses("reachy_mini", file) and ended.told["head"] == "reachy_mini"
     near, far = ended.told["poses"]

@@ -13,15 +13,7 @@ from sfms_robot.app.listen.page_observer import page_facts
 from sfms_robot.app.options import RunOptions
 from sfms_robot.config import load_head
 from sfms_robot.frames import MOTION_DIM
-from sfms_robot.viewer.page_messages import (
-    COMMANDS,
-    LONGEST_COMMAND,
-    LONGEST_PERSON,
-    VERSION,
-    frame_json,
-    pack_picture,
-    rare_json,
-)
+from sfms_robot.viewer import page_messages
 from sfms_robot.viewer.page_server import COMMAND_S, MOST_MALFORMED, OUTBOX, PERSON_S
 
 DOCS = Path(sfms_robot.__file__).parents[1] / "docs"
@@ -42,38 +34,32 @@ def rows(part: str) -> dict[str, set[str]]:
 
 def test_every_command_is_described_with_all_its_keys():
     described = rows(ASKED)
-    assert set(described) == set(COMMANDS)
-    for name, command in COMMANDS.items():
+    assert set(described) == set(page_messages.COMMANDS)
+    for name, command in page_messages.COMMANDS.items():
         keys = command.model_fields
         assert set(keys) - {"seconds"} <= described[name], name
         assert ("seconds" in described[name]) == ("seconds" in keys), name
 
 
-def test_every_message_to_a_page_is_described():
+def test_every_message_and_every_key_of_a_hello_and_of_a_frame_is_described():
     kinds = ("hello", "frame", "event", "status", "controls", "record", "over", "error", "pong")
     assert tuple(rows(TOLD)) == kinds
-
-
-def test_every_key_of_a_hello_is_described():
     head = load_head("face28")
     facts = page_facts(head, RunOptions(), turned(head), None, choices=True)
     keys = set(facts) | OF_VISITORS | set(facts["joints"][0]) | set(facts["listeners"][0]) | set(facts["source"])
     assert keys <= rows(TOLD)["hello"]
-
-
-def test_every_key_of_a_frame_is_described():
-    record = pack_picture(
-        0.0, np.zeros(MOTION_DIM), np.zeros(1), np.zeros(1, np.float32), rare_json("idle", (), {}, None)
+    record = page_messages.pack_picture(
+        0.0, np.zeros(MOTION_DIM), np.zeros(1), np.zeros(1, np.float32), page_messages.rare_json("idle", (), {}, None)
     )
-    assert set(json.loads(frame_json(record))) - {"type"} <= rows(TOLD)["frame"]
+    assert set(json.loads(page_messages.frame_json(record))) - {"type"} <= rows(TOLD)["frame"]
 
 
 @pytest.mark.parametrize(
     "said",
     [
-        f"version {VERSION},",
-        f"{LONGEST_COMMAND} characters",
-        f"{LONGEST_PERSON} bytes",
+        f"version {page_messages.VERSION},",
+        f"{page_messages.LONGEST_COMMAND} characters",
+        f"{page_messages.LONGEST_PERSON} bytes",
         f"{1 / COMMAND_S:g} a second, sound and faces at {1 / PERSON_S:g}",
         f"{OUTBOX} messages unread",
     ],

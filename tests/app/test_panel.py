@@ -51,22 +51,14 @@ def test_it_says_what_the_document_says():
     assert "speech begins" not in told  # nobody knows yet
 
 
-def test_who_asked_for_the_end_sees_that_it_comes():
+def test_it_shows_the_end_the_beginning_faults_hours_virtual_time_and_ascii():
     assert "stopping" in drawn(status(), ending=True)
-
-
-def test_before_the_first_tick_there_is_a_panel_too():
     assert "starting" in drawn(RunStatus(JOINTS, {}).document())
-
-
-def test_many_faults_are_counted_and_hours_are_hours():
     assert "and 2 more" in drawn(status(faults=JOINTS))
     assert "2:00:05 of 3:00:00" in drawn({**status(), "time_s": 7205.4, "duration_s": 10800.0})
-
-
-def test_in_virtual_time_nothing_is_said_of_rates():
     late = {"tick": {"target_hz": 100.0, "achieved_hz": None, "late": None}}
     assert "virtual time" in drawn(status(figures=late))
+    assert "####" in drawn(status(), encoding="ascii")
 
 
 @pytest.mark.parametrize("width", [40, 80, 200])
@@ -78,10 +70,6 @@ def test_no_line_is_wider_than_the_terminal(width, level, why, time_s):
     document = status("degraded", tuple(why), faults=JOINTS)
     document["person"] |= {"voice_db": level, "own_voice_db": level}
     assert max(map(len, drawn(document | {"time_s": time_s}, width).splitlines())) <= width
-
-
-def test_a_terminal_that_knows_ascii_alone_gets_ascii_alone():
-    assert "####" in drawn(status(), encoding="ascii")
 
 
 def test_intensity_is_one_number_where_all_regions_are_turned_alike_and_nothing_where_none_is():

@@ -57,15 +57,12 @@ def test_a_face_is_that_of_its_tick_and_between_two_between_them(recorded):
     np.testing.assert_array_equal(outside, motion[[0, -1]])
 
 
-def test_a_recording_tells_what_ran_on_what_and_how(recorded):
+def test_a_recording_tells_what_ran_on_what_and_how_and_holds_its_head_file(recorded, tmp_path):
     about = read_recording(recorded[0]).about
     assert {"version", "python", "platform", "started_utc", "listener_sha256"} <= set(about)
     assert len(about["listener_sha256"]) == 64 and "head_yaml" in about and "listener_config" in about
     options = json.loads(about["options"])
     assert options["head"] == HEAD and options["fast"] and options["style"] == ["neck=1.5"]
-
-
-def test_the_head_that_is_in_a_recording_is_a_head_file(recorded, tmp_path):
     (tmp_path / "head.yaml").write_text(read_recording(recorded[0]).about["head_yaml"])
     played = play_back(recorded[0], head=str(tmp_path), fast=True)
     assert played["head"] == HEAD and played["joints"] == play_back(recorded[0], fast=True)["joints"]

@@ -31,16 +31,13 @@ def test_without_a_terminal_a_line_every_ten_seconds_estimates_the_rest(capsys):
     assert len(lines.splitlines()) == 100 / PLAIN_EVERY_S - 1  # none when it has ended: the result follows
 
 
-def test_the_rest_of_a_resumed_training_counts_from_its_checkpoint(capsys):
+def test_lines_estimate_the_rest_from_the_checkpoint_or_say_how_long_it_took_so_far(capsys):
     now_s = [0.0]
     moved = PlainBar("tokenizer", lambda: now_s[0])
     moved(900, 1000, "loss 0.5")
     now_s[0] = 20.0
     moved(910, 1000, "loss 0.4")
     assert capsys.readouterr().err == "tokenizer: 91%, loss 0.4, about 3 min left\n"
-
-
-def test_work_of_unknown_length_says_how_long_it_took_so_far(capsys):
     now_s = [0.0]
     moved = PlainBar("composing dyads", lambda: now_s[0])
     now_s[0] = 30.0
@@ -53,8 +50,11 @@ def test_lengths_of_time_in_words(seconds, text):
     assert in_words(seconds) == text
 
 
-def test_short_work_without_a_terminal_is_silent(capsys):
+def test_short_work_is_silent_and_a_hidden_bar_shows_nothing(capsys):
     assert list(tracked([1, 2, 3], "counting")) == [1, 2, 3]
+    assert capsys.readouterr() == ("", "")
+    with bar("looking", hidden=True) as moved:
+        moved(1, 2, "id 1")
     assert capsys.readouterr() == ("", "")
 
 
@@ -85,9 +85,3 @@ def test_bars_may_be_nested_and_log_lines_stand_above_them(capsys):
         root.removeHandler(handler)
     text = capsys.readouterr().err
     assert "\x1b[2K2 clips cannot be read\n" in text  # in a line of its own, which is cleared before
-
-
-def test_a_hidden_bar_shows_nothing(capsys):
-    with bar("looking", hidden=True) as moved:
-        moved(1, 2, "id 1")
-    assert capsys.readouterr() == ("", "")

@@ -196,8 +196,6 @@ def test_after_an_interrupt_torque_is_off_or_named(more, ends):
 
 
 # --- release ----------------------------------------------------------------------------------------------------
-
-
 def left_by_a_killed_run(head, chains, clock):
     """Torque on, ports closed, nothing switched off."""
     bus = build_bus(head, chains, clock, confirmed=True)

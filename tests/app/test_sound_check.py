@@ -35,14 +35,11 @@ def test_what_is_not_as_it_should_be_is_found(speech, noise, finding):
     assert finding is None or finding in told["findings"][0]
 
 
-def test_levels_are_those_of_speech_and_of_the_room():
+def test_levels_are_those_of_speech_and_room_and_frames_that_did_not_come_are_said():
     told = judge_sound(frames_of(0.3, 0.003))
     assert told["level_dbfs"] == pytest.approx(-20.0, abs=0.5)
     assert told["noise_floor_dbfs"] == pytest.approx(-60.0, abs=0.5)
     assert told["seconds"] == 3.0 and told["missing_frames"] == 0 and told["clipped"] == 0.0
-
-
-def test_frames_that_did_not_come_are_said():
     nothing = np.zeros(0, np.float32)
     assert "nothing came" in judge_sound([nothing] * 75)["findings"][0]
     some = frames_of(0.3, 0.003)

@@ -12,17 +12,8 @@ from sfms_robot.app.serve.batch_process import Served
 from sfms_robot.app.serve.service import WorkerPool
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.frames import FRAME_S, SpeakerFrame
+from sfms_robot.listeners import remote_messages as messages
 from sfms_robot.listeners.registry import at_hop, load_listener
-from sfms_robot.listeners.remote_messages import (
-    Join,
-    Notice,
-    SentFrame,
-    Welcome,
-    frame_message,
-    parse_plan,
-    parse_words,
-    words_message,
-)
 
 LISTENER = "sfms-small"
 HOP = 3
@@ -32,9 +23,9 @@ SERVED = Served(listener=LISTENER, name="tested", hop=HOP, all_heads=True)
 
 def joined(pool, client, seed=0):
     answers = queue.SimpleQueue()
-    pool.join(words_message(Join(client, seed)), answers.put)
-    said = parse_words(answers.get(timeout=LIMIT_S))
-    assert isinstance(said, Welcome), said
+    pool.join(messages.words_message(messages.Join(client, seed)), answers.put)
+    said = messages.parse_words(answers.get(timeout=LIMIT_S))
+    assert isinstance(said, messages.Welcome), said
     return said.stream
 
 
@@ -61,11 +52,11 @@ def test_heads_are_dealt_evenly_and_each_has_the_frames_of_a_single_run():
         assert sorted(len(each.clients) for each in pool._workers) == [2, 2]
         for index in range(3 * HOP):
             for stream, frames in heard.items():
-                pool.receive(stream, frame_message(SentFrame(index, frames[index], 0.0)))
+                pool.receive(stream, messages.frame_message(messages.SentFrame(index, frames[index], 0.0)))
         plans = {stream: [] for stream in heard}
         while any(len(each) < 3 for each in plans.values()):
             stream, message = came.get(timeout=LIMIT_S)
-            plans[stream].append(parse_plan(message).plan.frames)
+            plans[stream].append(messages.parse_plan(message).plan.frames)
         told = pool.statistics()
         assert (told["processes"], told["heads"], told["plans"]) == (2, 4, 12)
     for seed, (stream, frames) in enumerate(heard.items()):
@@ -81,7 +72,7 @@ def test_a_process_that_dies_is_replaced_and_its_robots_are_told_to_join_again()
         os.kill(first.child.process.pid, signal.SIGKILL)
         pool._wait(lambda: pool._workers[0] is not first and pool._workers[0].capacity is not None)
         pool.receive(stream, b"anything")
-        assert came.get(timeout=LIMIT_S) == (stream, words_message(Notice("unknown")))
+        assert came.get(timeout=LIMIT_S) == (stream, messages.words_message(messages.Notice("unknown")))
         assert joined(pool, "a") != stream
 
 

@@ -1,14 +1,7 @@
 """ROBOTIS' own Python SDK, with its own port: what its examples do."""
 
 import pytest
-from dynamixel_sdk import (
-    BROADCAST_ID,
-    COMM_SUCCESS,
-    GroupSyncRead,
-    GroupSyncWrite,
-    PortHandler,
-    Protocol2PacketHandler,
-)
+from dynamixel_sdk import BROADCAST_ID, COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, PortHandler, Protocol2PacketHandler
 
 from sfms_robot.emulator.launch import EmulatedServo
 

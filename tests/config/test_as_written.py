@@ -25,7 +25,6 @@ def trained(name: str) -> Any:
 
 
 # --- SFMS -----------------------------------------------------------------------------------------------------------
-
 SFMS = {
     "III-B: 52 expressions and 6 of pose": lambda one: one.listener.motion_space == "faceverse58",
     "IV-B2, Algorithm 1, (4) to (7): keyframes by Gumbel top-k scores": lambda one: (
@@ -75,7 +74,6 @@ def test_the_configuration_does_what_the_sfms_paper_says(said, name):
 
 
 # --- ARIG -----------------------------------------------------------------------------------------------------------
-
 ARIG = {
     "(1): told of sounds and motions": lambda one: not one.listener.events and not one.listener.phase,
     "3.2: both modalities": lambda one: one.listener.visual,
@@ -122,7 +120,6 @@ def test_the_configuration_does_what_the_arig_paper_says(said, name):
 
 
 # --- the papers' sizes ----------------------------------------------------------------------------------------------
-
 WIDTHS = {
     "sfms": {"tokenizer_width": 256, "predictor_width": 256},  # V-B
     "arig": {"width": 512, "feedforward": 2048, "context_chunks": 512},  # A.2, 4.1
@@ -156,7 +153,6 @@ def test_both_papers_optimizer_is_theirs():
 
 
 # --- what the shipped listeners do besides --------------------------------------------------------------------------
-
 PAIRS = {"sfms-small": ("sfms-small", "sfms-as-written"), "arig-small": ("arig", "arig-as-written")}
 
 
@@ -194,13 +190,9 @@ def named(card: Path) -> set[str]:
 
 
 @pytest.mark.parametrize("listener", PAIRS)
-def test_a_card_names_every_departure_from_its_paper(listener):
+def test_a_card_names_every_departure_from_its_paper_with_the_same_size_steps_and_budget(listener):
     card = data_dir("configs") / "listeners" / listener / "CARD.md"
     assert departures(listener) - named(card) == set(), f"{card.parent.name}: not named in its card"
-
-
-@pytest.mark.parametrize("listener", PAIRS)
-def test_the_paper_has_the_same_size_steps_and_budget(listener):
     ours, paper = (trained(name) for name in PAIRS[listener])
     for part in ("training",) if listener == "arig-small" else ("tokenizer", "predictor"):
         for key in ("steps", "batch", "learning_rate", "precision", "evaluate_every"):

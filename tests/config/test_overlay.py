@@ -8,31 +8,14 @@ import pytest
 import yaml
 
 from sfms_robot.config import load_firmware_map, load_head
+from sfms_robot.config import overlay as overlays
 from sfms_robot.config.joint import Expression
-from sfms_robot.config.overlay import (
-    OLD_FILE,
-    SHOWN,
-    CalibrateLayer,
-    FitLayer,
-    Fitted,
-    Identity,
-    Measured,
-    Overlay,
-    calibrated,
-    head_hash,
-    layered,
-    load_overlay,
-    overlay_file,
-    provenance,
-    record_stored,
-    save_overlay,
-)
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 
 DAY = date(2026, 5, 17)
-SHA = head_hash("face28")
+SHA = overlays.head_hash("face28")
 FACE = load_head("face28")
 
 
@@ -41,24 +24,26 @@ def _own_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
 
 
-def measured(joint="jaw", low=1800, rest=2000, high=2400, sign=1, **more) -> Measured:
+def measured(joint="jaw", low=1800, rest=2000, high=2400, sign=1, **more) -> overlays.Measured:
     config = FACE.joints[joint]
     known = {"id": config.id, "model": config.model, "firmware": 53, "homing_offset": 0, "drive_mode": 0}
     ticks = {"min_ticks": low, "center_ticks": rest, "max_ticks": high}
-    return Measured.model_validate({**known, "date": DAY, "sign": sign, **ticks, **more})
+    return overlays.Measured.model_validate({**known, "date": DAY, "sign": sign, **ticks, **more})
 
 
-def identity(found: Measured) -> Identity:
-    return Identity(**{key: getattr(found, key) for key in Identity.model_fields})
+def identity(found: overlays.Measured) -> overlays.Identity:
+    return overlays.Identity(**{key: getattr(found, key) for key in overlays.Identity.model_fields})
 
 
-def overlay(sha256=SHA, fit=None, **joints) -> Overlay:
-    return Overlay(head="face28", calibrate=CalibrateLayer(head_sha256=sha256, joints=joints), fit=fit)
+def overlay(sha256=SHA, fit=None, **joints) -> overlays.Overlay:
+    return overlays.Overlay(
+        head="face28", calibrate=overlays.CalibrateLayer(head_sha256=sha256, joints=joints), fit=fit
+    )
 
 
 FITTED = "brow_inner_left"
-LEARNT = Fitted(drive=Expression(channel="browInnerUp", curve=((0, 0), (1, 0.5))))
-FIT = FitLayer(head_sha256=SHA, date=DAY, joints={FITTED: LEARNT})
+LEARNT = overlays.Fitted(drive=Expression(channel="browInnerUp", curve=((0, 0), (1, 0.5))))
+FIT = overlays.FitLayer(head_sha256=SHA, date=DAY, joints={FITTED: LEARNT})
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -68,7 +53,7 @@ def test_ends_and_rest_lie_where_they_were_measured(joint, sign):
     at_end = config.rest_deg == config.min_deg
     ticks = (1800, 1800 if at_end else 2010, 2400)
     low, rest, high = ticks if sign > 0 else [4095 - t for t in ticks]
-    found = calibrated(config, measured(joint, low, rest, high, sign))
+    found = overlays.calibrated(config, measured(joint, low, rest, high, sign))
     turn = load_firmware_map(config.model).ticks_per_revolution
     conversion = Calibration({joint: found}, np.array([turn]))
     angles = [[math.radians(found.min_deg)], [found.rest_rad], [found.max_rad]]
@@ -79,20 +64,17 @@ def test_ends_and_rest_lie_where_they_were_measured(joint, sign):
 
 def test_it_is_read_back_as_it_was_written():
     whole = overlay(jaw=measured(), lid_left=measured("lid_left", firmware=None), fit=FIT)
-    save_overlay(whole, overlay_file("face28"))
-    assert load_overlay(FACE) == whole
-    assert list(overlay_file("face28").parent.iterdir()) == [overlay_file("face28")]
+    overlays.save_overlay(whole, overlays.overlay_file("face28"))
+    assert overlays.load_overlay(FACE) == whole
+    assert list(overlays.overlay_file("face28").parent.iterdir()) == [overlays.overlay_file("face28")]
 
 
-def test_without_an_overlay_the_head_is_as_its_file_says():
-    layers = layered(FACE, load_overlay(FACE), SHA)
+def test_without_an_overlay_the_head_is_as_its_file_says_and_with_one_only_what_was_measured_changes():
+    layers = overlays.layered(FACE, overlays.load_overlay(FACE), SHA)
     assert layers.head == FACE and not layers.calibrated and not layers.refused
-
-
-def test_only_what_was_measured_changes():
-    layers = layered(FACE, overlay(jaw=measured()), SHA, {"jaw": identity(measured())})
+    layers = overlays.layered(FACE, overlay(jaw=measured()), SHA, {"jaw": identity(measured())})
     assert layers.calibrated == {"jaw"} and not layers.refused
-    assert layers.head.joints["jaw"] == calibrated(FACE.joints["jaw"], measured())
+    assert layers.head.joints["jaw"] == overlays.calibrated(FACE.joints["jaw"], measured())
     assert {**layers.head.joints, "jaw": None} == {**FACE.joints, "jaw": None}
 
 
@@ -109,30 +91,27 @@ def test_only_what_was_measured_changes():
 def test_a_joint_with_another_servo_is_to_be_calibrated_first_and_no_other(now, why):
     both = overlay(jaw=measured(), lid_left=measured("lid_left"))
     servos = {"jaw": identity(measured()), "lid_left": identity(measured("lid_left"))}
-    servos["jaw"] = None if now is None else Identity(**{**servos["jaw"].model_dump(), **now})
-    layers = layered(FACE, both, SHA, servos)
+    servos["jaw"] = None if now is None else overlays.Identity(**{**servos["jaw"].model_dump(), **now})
+    layers = overlays.layered(FACE, both, SHA, servos)
     assert layers.refused == {"jaw": why} and layers.calibrated == {"lid_left"}
     assert layers.head.joints["jaw"] == FACE.joints["jaw"]
 
 
-def test_an_edited_head_file_puts_every_joint_back():
-    layers = layered(FACE, overlay("0" * 64, jaw=measured(), fit=FIT), SHA)
-    assert layers.refused == {"jaw": OLD_FILE} and layers.fitted == {FITTED}
-    old = FIT.model_copy(update={"head_sha256": "0" * 64})
-    layers = layered(FACE, overlay(jaw=measured(), fit=old), SHA)
-    assert layers.calibrated == {"jaw"} and not layers.fitted and OLD_FILE in layers.notes[0]
-
-
-def test_a_fitted_drive_lies_over_a_measured_joint():
+def test_a_fitted_drive_lies_over_a_measured_joint_and_an_edited_head_file_puts_every_joint_back():
     joint = FITTED
-    layers = layered(FACE, overlay(fit=FIT, **{joint: measured(joint)}), SHA)
+    layers = overlays.layered(FACE, overlay(fit=FIT, **{joint: measured(joint)}), SHA)
     assert layers.head.joints[joint].zero_ticks != FACE.joints[joint].zero_ticks
     assert layers.head.joints[joint].drive == FIT.joints[joint].drive
+    layers = overlays.layered(FACE, overlay("0" * 64, jaw=measured(), fit=FIT), SHA)
+    assert layers.refused == {"jaw": overlays.OLD_FILE} and layers.fitted == {FITTED}
+    old = FIT.model_copy(update={"head_sha256": "0" * 64})
+    layers = overlays.layered(FACE, overlay(jaw=measured(), fit=old), SHA)
+    assert layers.calibrated == {"jaw"} and not layers.fitted and overlays.OLD_FILE in layers.notes[0]
 
 
 def test_show_tells_calibrated_and_fitted_values_from_those_of_the_file():
-    save_overlay(overlay(jaw=measured(), fit=FIT), overlay_file("face28"))
-    told, refused = provenance("face28")
+    overlays.save_overlay(overlay(jaw=measured(), fit=FIT), overlays.overlay_file("face28"))
+    told, refused = overlays.provenance("face28")
     assert told["jaw"]["sign"] == (1, "calibrate 2026-05-17")
     assert told["jaw"]["max_deg"][1] == "calibrate 2026-05-17"
     assert told["jaw"]["id"][1] == "head file"
@@ -142,9 +121,10 @@ def test_show_tells_calibrated_and_fitted_values_from_those_of_the_file():
 
 
 def test_show_tells_what_does_not_hold():
-    save_overlay(overlay("0" * 64, jaw=measured()), overlay_file("face28"))
-    told, refused = provenance("face28")
-    assert refused == [f"jaw: its calibration does not hold: {OLD_FILE}"] and told["jaw"]["sign"][1] == "built in"
+    overlays.save_overlay(overlay("0" * 64, jaw=measured()), overlays.overlay_file("face28"))
+    told, refused = overlays.provenance("face28")
+    assert refused == [f"jaw: its calibration does not hold: {overlays.OLD_FILE}"]
+    assert told["jaw"]["sign"][1] == "built in"
 
 
 @pytest.mark.parametrize(
@@ -166,23 +146,21 @@ def test_a_mistake_in_the_overlay_is_named_with_its_file(change, message):
         plain["calibrate"] |= change
     else:
         plain["calibrate"]["joints"]["jaw"] |= change
-    file = overlay_file("face28")
+    file = overlays.overlay_file("face28")
     file.parent.mkdir(parents=True)
     file.write_text(yaml.safe_dump(plain))
     with pytest.raises(ConfigError, match=message) as caught:
-        load_overlay(FACE)
+        overlays.load_overlay(FACE)
     assert str(file) in str(caught.value)
 
 
 def test_an_unknown_joint_is_named_with_those_there_are():
-    save_overlay(overlay(chin=measured()), overlay_file("face28"))
+    overlays.save_overlay(overlay(chin=measured()), overlays.overlay_file("face28"))
     with pytest.raises(ConfigError, match="calibrate.joints = 'chin' is not a joint of this head .*jaw"):
-        load_overlay(FACE)
+        overlays.load_overlay(FACE)
 
 
 # --- what servos have stored ------------------------------------------------------------------------------------
-
-
 def copied(folder, *changes):
     """A head of the user's own: a shipped one, some words of its file changed."""
     text = (find("heads", "interbotix_wxxms", "head.yaml") / "head.yaml").read_text()
@@ -197,13 +175,16 @@ def copied(folder, *changes):
 def test_a_stored_value_goes_into_the_user_s_own_file_and_all_else_in_it_stays(tmp_path):
     name = copied(tmp_path / "turret")
     before = (tmp_path / "turret" / "head.yaml").read_text()
-    assert record_stored(name, "tilt", {"drive_mode": 0, "homing_offset": -100}) == tmp_path / "turret" / "head.yaml"
+    assert (
+        overlays.record_stored(name, "tilt", {"drive_mode": 0, "homing_offset": -100})
+        == tmp_path / "turret" / "head.yaml"
+    )
     after = (tmp_path / "turret" / "head.yaml").read_text()
     assert after == before.replace("{stored: {drive_mode: 1}}", "{stored: {homing_offset: -100, drive_mode: 0}}")
     head = load_head(name)
     assert head.safety_of("tilt").stored == {"drive_mode": 0, "homing_offset": -100}
     assert head.safety_of("pan").stored == {"drive_mode": 0}
-    assert not overlay_file(head.name).exists()
+    assert not overlays.overlay_file(head.name).exists()
 
 
 SHARED = {
@@ -220,9 +201,9 @@ def test_a_file_in_which_one_joint_cannot_change_alone_gets_an_overlay(tmp_path,
     name = copied(tmp_path / "turret", *SHARED[form])
     before = (tmp_path / "turret" / "head.yaml").read_text()
     head = load_head(name)
-    assert record_stored(name, "pan", {"drive_mode": 4}) == overlay_file(head.name)
+    assert overlays.record_stored(name, "pan", {"drive_mode": 4}) == overlays.overlay_file(head.name)
     assert (tmp_path / "turret" / "head.yaml").read_text() == before
-    now = layered(head, load_overlay(head), head_hash(name)).head
+    now = overlays.layered(head, overlays.load_overlay(head), overlays.head_hash(name)).head
     assert now.safety_of("pan").stored == {"drive_mode": 4} and now.joints["tilt"] == head.joints["tilt"]
 
 
@@ -230,24 +211,24 @@ def test_a_shipped_head_and_one_that_was_calibrated_are_not_edited(tmp_path):
     shipped = find("heads", "interbotix_wxxms", "head.yaml") / "head.yaml"
     before = shipped.read_bytes()
     for name in ("interbotix_wxxms", str(shipped.parent), copied(tmp_path / "turret")):
-        assert record_stored(name, "tilt", {"drive_mode": 0}) == overlay_file("interbotix_wxxms")
+        assert overlays.record_stored(name, "tilt", {"drive_mode": 0}) == overlays.overlay_file("interbotix_wxxms")
     assert shipped.read_bytes() == before == (tmp_path / "turret" / "head.yaml").read_bytes()
-    record_stored("interbotix_wxxms", "pan", {"drive_mode": 1}, practice=True)
-    head, sha256 = load_head("interbotix_wxxms"), head_hash("interbotix_wxxms")
-    now = layered(head, load_overlay(head), sha256).head
+    overlays.record_stored("interbotix_wxxms", "pan", {"drive_mode": 1}, practice=True)
+    head, sha256 = load_head("interbotix_wxxms"), overlays.head_hash("interbotix_wxxms")
+    now = overlays.layered(head, overlays.load_overlay(head), sha256).head
     assert [now.safety_of(joint).stored["drive_mode"] for joint in ("pan", "tilt")] == [0, 0]
-    assert layered(head, load_overlay(head), "0" * 64).head == head  # recorded for another file
+    assert overlays.layered(head, overlays.load_overlay(head), "0" * 64).head == head  # recorded for another file
 
 
 def test_what_was_measured_keeps_what_the_head_declares_for_all_joints():
     usual = FACE.safety.model_copy(update={"stored": {"operating_mode": 3}})
     head = FACE.model_copy(update={"safety": usual})
-    now = layered(head, overlay(jaw=measured()), SHA).head
+    now = overlays.layered(head, overlay(jaw=measured()), SHA).head
     assert now.safety_of("jaw").stored == {"operating_mode": 3, "homing_offset": 0, "drive_mode": 0}
 
 
 def test_a_value_comes_from_its_own_line_its_twin_the_defaults_or_nowhere():
-    told, _ = provenance("face28")
+    told, _ = overlays.provenance("face28")
     assert told["eye_pan_right"]["id"] == (2, "head file")
     assert told["eye_pan_right"]["max_deg"] == (30.0, "mirror of eye_pan_left")
     assert told["eye_pan_right"]["model"] == ("xl330-m288", "joint_defaults")
@@ -258,6 +239,6 @@ def test_a_value_comes_from_its_own_line_its_twin_the_defaults_or_nowhere():
 
 
 def test_every_joint_and_key_is_there():
-    told, _ = provenance("reachy_mini")
+    told, _ = overlays.provenance("reachy_mini")
     assert list(told) == list(load_head("reachy_mini").joints)
-    assert all(tuple(values) == SHOWN for values in told.values())
+    assert all(tuple(values) == overlays.SHOWN for values in told.values())

@@ -97,8 +97,6 @@ def test_every_command_without_hardware_succeeds(line, folder):
 
 
 # --- troubleshooting --------------------------------------------------------------------------------------------------
-
-
 def literal(node):
     """Return the text of a string expression, with ... for what is filled in; "" where it is not literal."""
     if isinstance(node, ast.Constant):
@@ -135,7 +133,6 @@ def test_every_warning_and_error_is_explained():
 
 
 # --- one source for speeds --------------------------------------------------------------------------------------------
-
 SPEED = r"\d[\d.,]* (?:ms|us|ticks/s|ticks a second|plans a second|of a core|MB resident)\b"
 
 

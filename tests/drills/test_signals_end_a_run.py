@@ -4,37 +4,23 @@ import json
 import os
 import signal
 
+import drill_rig as rig
 import pytest
-from drill_rig import (
-    DURATION_S,
-    PAN,
-    Command,
-    Terminal,
-    connecting,
-    enabling,
-    listening,
-    loading,
-    more_said,
-    resting,
-    run,
-    said,
-    torque,
-)
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="no /proc here")]
-PHASES = (loading, connecting, enabling, listening, resting)
+PHASES = (rig.loading, rig.connecting, rig.enabling, rig.listening, rig.resting)
 HIDE, SHOW = b"\x1b[?25l", b"\x1b[?25h"
 CASES = [(phase, number) for phase in PHASES for number in (signal.SIGINT, signal.SIGTERM)]
-CASES += [(listening, signal.SIGHUP), (connecting, signal.SIGHUP)]
+CASES += [(rig.listening, signal.SIGHUP), (rig.connecting, signal.SIGHUP)]
 
 
 def assert_limp(chain):
-    assert torque(chain) == (False, False)
+    assert rig.torque(chain) == (False, False)
 
 
 @pytest.mark.parametrize(("phase", "number"), CASES, ids=[f"{p.__name__}-{n.name}" for p, n in CASES])
 def test_a_signal_ends_a_run_without_torque_and_without_a_word(phase, number, slow_head, device, chain):
-    with run(slow_head, device, "--json", duration_s=DURATION_S.get(phase, 600)) as running:
+    with rig.run(slow_head, device, "--json", duration_s=rig.DURATION_S.get(phase, 600)) as running:
         phase(running, chain)
         running.signal(number)
         code, out, err = running.ended()
@@ -52,7 +38,7 @@ def in_the_background():
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize("phase", [loading, connecting, listening], ids=lambda each: each.__name__)
+@pytest.mark.parametrize("phase", [rig.loading, rig.connecting, rig.listening], ids=lambda each: each.__name__)
 def test_an_interrupt_ends_a_run_that_a_script_started_in_the_background(
     phase, in_the_background, slow_head, device, chain
 ):
@@ -66,7 +52,7 @@ def once(running, chain):
 def twice(running, chain):
     running.signal(signal.SIGINT)
     running.until(running.heeded)
-    more_said(running, chain, 100)  # Python has seen it too: a tick has passed
+    rig.more_said(running, chain, 100)  # Python has seen it too: a tick has passed
     running.signal(signal.SIGINT)
 
 
@@ -74,25 +60,25 @@ def many_times(running, chain):
     for _ in range(27):
         if running.process.poll() is None:
             running.signal(signal.SIGINT)
-            said(chain)  # something else meanwhile
+            rig.said(chain)  # something else meanwhile
 
 
 @pytest.mark.parametrize(
     ("phase", "press"),
     [
-        (enabling, once),
-        (listening, once),
-        (resting, once),
-        (listening, twice),
-        (resting, twice),
-        (listening, many_times),
+        (rig.enabling, once),
+        (rig.listening, once),
+        (rig.resting, once),
+        (rig.listening, twice),
+        (rig.resting, twice),
+        (rig.listening, many_times),
     ],
     ids=lambda each: each.__name__,
 )
 def test_who_insists_gets_no_torque_and_the_cursor_back(phase, press, slow_head, device, chain):
-    terminal = Terminal()
-    with run(
-        slow_head, device, stderr=terminal.far, duration_s=DURATION_S.get(phase, 600), TERM="xterm", COLUMNS="80"
+    terminal = rig.Terminal()
+    with rig.run(
+        slow_head, device, stderr=terminal.far, duration_s=rig.DURATION_S.get(phase, 600), TERM="xterm", COLUMNS="80"
     ) as running:
         phase(running, chain)
         press(running, chain)
@@ -105,8 +91,10 @@ def test_who_insists_gets_no_torque_and_the_cursor_back(phase, press, slow_head,
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda each: each.name)
 def test_a_servo_moved_by_hand_is_limp_again_after_a_signal(number, device, chain):
-    with Command("servo", "move", PAN, "--by", "1000", "--baud", 1_000_000, "--port", device, "--json") as moving:
-        moving.until(lambda: any(torque(chain)))
+    with rig.Command(
+        "servo", "move", rig.PAN, "--by", "1000", "--baud", 1_000_000, "--port", device, "--json"
+    ) as moving:
+        moving.until(lambda: any(rig.torque(chain)))
         moving.signal(number)
         code, out, err = moving.ended()
     assert_limp(chain)

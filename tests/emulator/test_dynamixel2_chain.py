@@ -78,13 +78,10 @@ def test_write_is_checked(host, name, value, error):
     assert host.read(1, name) == (before if error else value)
 
 
-def test_eeprom_is_locked_under_torque(host):
+def test_what_may_not_be_done_is_refused(host):
     assert host.write(1, "torque_enable", 1) == 0
     assert host.write(1, "return_delay_time", 0) == dxl2.ACCESS_ERROR
     assert host.write(1, "led", 1) == 0
-
-
-def test_unknown_instruction_is_refused(host):
     assert [packet.error for packet in host.ask(1, 0x77)] == [dxl2.INSTRUCTION_ERROR]
 
 
@@ -97,9 +94,10 @@ def test_status_return_level_decides_who_answers(host):
     assert len(host.ask(1, dxl2.PING)) == 1
 
 
-def test_sync_read_answers_in_list_order_up_to_the_first_silent_id(host):
+def test_sync_read_is_answered_in_list_order_up_to_the_first_silent_id_and_broadcast_ping_in_slots(host):
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x01\x02")] == [3, 1, 2]
     assert [p.servo for p in host.ask(dxl2.BROADCAST, dxl2.SYNC_READ, words(132, 4) + b"\x03\x09\x02")] == [3]
+    assert all(reply.pause_s >= 0.003 for reply in host.replies(dxl2.BROADCAST, dxl2.PING))
 
 
 def test_watchdog_is_fed_by_any_instruction(host):
@@ -141,11 +139,12 @@ def test_fast_sync_read_is_one_packet_that_stops_short_at_a_silent_id(host, dead
         assert replies[0].data[5] == 1 + 3 * 8  # announced whole
 
 
-def test_fast_bulk_read_has_its_own_length_for_each(host):
+def test_fast_bulk_read_has_its_own_length_for_each_and_old_firmware_knows_no_fast_reads(host):
     request = b"\x01" + words(132, 4) + b"\x02" + words(146, 1)
     [reply] = host.replies(dxl2.BROADCAST, 0x9A, request)
     assert reply.data[8:14] == bytes([0, 1]) + (2001).to_bytes(4, "little")
     assert reply.data[16:19] == bytes([0, 2, 31])
+    assert Host(1, firmware=44).replies(dxl2.BROADCAST, dxl2.FAST_SYNC_READ, POSITIONS + b"\x01") == []
 
 
 def test_fast_read_of_a_block_that_holds_a_header_is_not_stuffed():
@@ -160,10 +159,6 @@ def test_fast_read_of_a_block_that_holds_a_header_is_not_stuffed():
     assert dxl2.split_fast_status(fast.data, 3) == [(1, 0, b"\xff\xff\xfd")]
 
 
-def test_old_firmware_does_not_know_fast_reads():
-    assert Host(1, firmware=44).replies(dxl2.BROADCAST, dxl2.FAST_SYNC_READ, POSITIONS + b"\x01") == []
-
-
 def test_second_id_obeys_and_says_nothing(host):
     for servo in (2, 3):
         assert host.write(servo, "secondary_id", 1) == 0
@@ -173,16 +168,9 @@ def test_second_id_obeys_and_says_nothing(host):
     assert [host.read(i, "led") for i in (1, 2, 3)] == [0, 0, 0]
 
 
-def test_two_servos_with_one_id_talk_over_one_another(host):
+def test_a_changed_id_is_answered_under_the_old_one_and_two_of_one_id_talk_over_one_another(host):
+    assert [p.servo for p in host.ask(3, dxl2.WRITE, words(7) + b"\x09")] == [3]
+    assert [p.servo for p in host.ask(9, dxl2.PING)] == [9]
     assert host.write(2, "id", 1) == 0
     both = host.replies(1, dxl2.READ, POSITIONS)
     assert len(both) == 1 and maybe_packet(bytearray(both[0].data)) is None  # 2001 and 2002 at once: the crc is wrong
-
-
-def test_change_of_id_is_answered_under_the_old_one(host):
-    assert [p.servo for p in host.ask(3, dxl2.WRITE, words(7) + b"\x09")] == [3]
-    assert [p.servo for p in host.ask(9, dxl2.PING)] == [9]
-
-
-def test_broadcast_ping_is_answered_in_slots(host):
-    assert all(reply.pause_s >= 0.003 for reply in host.replies(dxl2.BROADCAST, dxl2.PING))

@@ -109,15 +109,12 @@ def test_one_seed_throws_the_same_dice():
     assert 60 < sum(not replies for replies in run(1)) < 140
 
 
-def test_beginnings_and_ends_come_once_in_order():
+def test_beginnings_and_ends_come_once_in_order_and_clearing_ends_what_goes_on():
     faults = faults_of("stuck:1@2-3", "overload:2@1")
     assert faults.next_s == 1.0
     assert [(t, f.kind, began) for t, f, began in faults.edges(2.5)] == [(1.0, "overload", True), (2.0, "stuck", True)]
     assert [(t, f.kind, began) for t, f, began in faults.edges(9.0)] == [(3.0, "stuck", False)]
     assert list(faults.edges(9.0)) == [] and faults.next_s == math.inf
-
-
-def test_clearing_lets_go_what_goes_on():
     faults = faults_of("stuck:1", "drop@5", "drop")
     assert len(list(faults.edges(1.0))) == 2
     faults.clear(1.0)

@@ -204,11 +204,15 @@ def test_link_is_made_and_removed(tmp_path):
     assert not os.path.lexists(link)
 
 
-def test_stale_link_of_a_killed_emulator_is_replaced(tmp_path):
+def test_a_link_of_a_killed_emulator_is_replaced_and_taken_away(tmp_path):
     link = tmp_path / "servos"
     link.symlink_to(tmp_path / "gone")
     with launch([EmulatedServo(1)], link=str(link)):
         assert len(ping(str(link), 1)) == 14
+    with launch([EmulatedServo(1)], link=str(link)) as chain:
+        os.kill(chain.pid, signal.SIGKILL)
+        assert wait([chain]) is chain
+    assert not link.is_symlink()
 
 
 @pytest.mark.parametrize(
@@ -259,8 +263,6 @@ def test_every_family_can_share_a_wire():
 
 
 # --- the end of the process -------------------------------------------------------------------------------------
-
-
 def test_hosts_at_a_tcp_port_share_the_wire_and_lose_nothing_they_wrote():
     with launch([EmulatedServo(1), EmulatedServo(2)], transport="tcp") as chain:
         first, second = (SerialPort(chain.device, BAUD, RealClock()) for _ in range(2))
@@ -288,11 +290,3 @@ def test_emulator_needs_no_heavy_library():
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.split()
     assert "sfms_robot.emulator.servo_chains" in loaded
     assert not {"torch", "scipy", "numpy", "pydantic", "yaml"} & {*loaded}
-
-
-def test_link_of_an_emulator_that_was_killed_is_taken_away(tmp_path):
-    link = tmp_path / "servos"
-    with launch([EmulatedServo(1)], link=str(link)) as chain:
-        os.kill(chain.pid, signal.SIGKILL)
-        assert wait([chain]) is chain
-    assert not link.is_symlink()

@@ -23,13 +23,10 @@ def phone(receiver):
     emulated.close()
 
 
-def test_the_shipped_packets_are_one_phones():
+def test_the_shipped_packets_are_one_phones_and_a_number_is_all_that_changes():
     packets = recorded_packets()
     assert len(packets) == 180
     assert {parse_packet(each).subject for each in packets} == {"LLV Default Device"}
-
-
-def test_a_number_is_all_that_changes():
     first = recorded_packets()[0]
     again = renumbered(first, 7)
     assert parse_packet(again).number == 7

@@ -37,12 +37,9 @@ def test_without_torque_it_stays(start, time_s):
     assert moved(start, None, time_s).position == start
 
 
-def test_profile_velocity_is_kept():
+def test_a_profile_is_kept():
     plant = moved(0, MotorCommand(4000.0, TOP, 1000.0, 0.0), 1.0)
     assert abs(plant.reference - 1000.0) < 5.0 and abs(plant.speed - 1000.0) < 5.0
-
-
-def test_profile_acceleration_is_kept():
     plant = moved(0, MotorCommand(4000.0, TOP, 3000.0, 2000.0), 0.5)
     assert abs(plant.reference_speed - 1000.0) < 10.0
 

@@ -95,15 +95,12 @@ def test_sync_read_is_answered_in_order_up_to_the_first_that_is_silent():
     assert [frame.servo for frame in ask(device, BROADCAST, protocol1.SYNC_READ, params)] == [3, 2]
 
 
-def test_scs_knows_no_sync_read_and_ax_no_bulk_read():
+def test_what_a_protocol_lacks_is_silence():
     device = chain_of("scs0009", "ax-12a", "mx-28-1.0")
     assert ask(device, BROADCAST, protocol1.SYNC_READ, protocol1.sync_read_params(56, 2, [1])) == []
     assert ask(device, BROADCAST, protocol1.BULK_READ, protocol1.bulk_read_params([(2, 36, 2)])) == []
     (answer,) = ask(device, BROADCAST, protocol1.BULK_READ, protocol1.bulk_read_params([(3, 36, 2)]))
     assert answer == Frame(3, 0, b"\x00\x08")
-
-
-def test_broadcast_ping_is_a_feetech_matter():
     device = chain_of("sts3215", "ax-12a", "scs0009")
     assert [frame.servo for frame in ask(device, BROADCAST, protocol1.PING)] == [1, 3]
 

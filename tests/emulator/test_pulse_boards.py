@@ -24,25 +24,20 @@ def errors(board):
     return int.from_bytes(board.receive(maestro.get_errors(), 115200, 0.0), "little")
 
 
-def test_maestro_is_deaf_until_it_has_seen_the_baud_byte():
+def test_boards_hear_their_own_baud_rate_alone():
     board = device_of(*servos_of("maestro-24", 0))
     assert board.receive(maestro.get_errors(), 115200, 0.0) == b""
     assert board.receive(AA + maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
     assert board.receive(maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
-
-
-def test_maestro_takes_the_baud_byte_as_the_start_of_a_pololu_command():
     board = device_of(*servos_of("maestro-24", 0))
     assert board.receive(maestro.addressed(maestro.get_errors()), 57600, 0.0) == b"\x00\x00"
     assert board.baud == 57600
-
-
-def test_maestro_hears_no_other_baud_rate_and_says_so_later():
     board = maestro_board()
     board.receive(maestro.set_target(0, 6000), 115200, 0.0)
     assert board.receive(maestro.get_errors(), 9600, 0.0) == b""
     assert errors(board) == maestro.SIGNAL_ERROR
     assert position(board, 0, 0.0) == 0  # an error sends all home, and home is off
+    assert ssc_board().receive(ssc32.query_moving(), 9600, 0.0) == b""
 
 
 def test_target_without_a_speed_limit_is_there_at_once_and_the_shaft_follows():
@@ -73,13 +68,10 @@ def test_smallest_acceleration_takes_about_three_seconds_for_a_millisecond_of_pu
     assert position(board, 0, 4.0) == 8000
 
 
-def test_targets_are_held_inside_the_limits_of_a_channel():
+def test_targets_are_held_inside_the_limits_of_a_channel_and_a_micro_maestro_knows_no_multiple_ones():
     board = maestro_board()
     board.receive(maestro.set_targets(0, [100, 16000]), 115200, 0.0)
     assert (position(board, 0, 0.0), position(board, 1, 0.0)) == (992 * 4, 2000 * 4)
-
-
-def test_micro_maestro_knows_no_multiple_targets():
     board = maestro_board("maestro-6")
     board.receive(maestro.set_targets(0, [6000, 6000]), 115200, 0.0)
     assert errors(board) == maestro.PROTOCOL_ERROR
@@ -93,10 +85,12 @@ def test_nonsense_is_a_protocol_error_and_reading_it_clears_it(command):
     assert errors(board) == 0
 
 
-def test_shaft_without_pulses_stays_where_it_is():
+def test_a_channel_without_pulses_stays_where_it_is_and_one_without_a_servo_is_none():
     board = maestro_board(start_ticks=5000)
     board.advance(10.0)
     assert board.servo(0).plant.position == 5000
+    board = maestro_board(channels=[4])
+    assert board.servo(4).id == 4 and board.servo(5) is None
 
 
 def test_board_is_unplugged_when_every_channel_is_dead():
@@ -126,11 +120,6 @@ def test_board_with_crc_obeys_what_has_one_and_answers_without(sent, pulse, erro
     assert answer == error.to_bytes(2, "little") and board.servo(0).pulse == pulse
 
 
-def test_channel_without_a_servo_is_nobody():
-    board = maestro_board(channels=[4])
-    assert board.servo(4).id == 4 and board.servo(5) is None
-
-
 def ssc_board(baud=115200):
     return device_of(*servos_of("ssc-32", *range(8), baud=baud))
 
@@ -154,10 +143,6 @@ def test_slower_of_speed_and_time_counts():
     board.receive(ssc32.group_move({0: Move(1000)}), 115200, 0.0)
     board.receive(ssc32.group_move({0: Move(2000, 500)}, 100), 115200, 0.0)
     assert pulses(board, [0], 1.0) == [150]
-
-
-def test_ssc32_hears_no_other_baud_rate():
-    assert ssc_board().receive(ssc32.query_moving(), 9600, 0.0) == b""
 
 
 @given(st.lists(st.binary(max_size=64), max_size=20), st.sampled_from(["maestro-24", "maestro-6", "ssc-32"]))

@@ -87,14 +87,11 @@ def test_indirect_data_write_through():
     assert bench.get("led") == 1
 
 
-def test_homing_offset_shifts_what_the_servo_tells_and_is_told():
+def test_a_homing_offset_shifts_and_reverse_mode_mirrors_the_position():
     bench = ServoBench(start=2048, homing_offset=1024)
     assert bench.servo.plant.position == 1024 and bench.get("present_position") == 2048
     bench.put(torque_enable=1, goal_position=2500)
     assert bench.after(2.0) == 2500 and bench.servo.plant.position == 2500 - 1024
-
-
-def test_reverse_mode_mirrors_the_position_but_not_the_offset():
     bench = ServoBench(start=2500, drive_mode=1)
     assert bench.servo.plant.position == 4096 - 2500
     bench.put(torque_enable=1, goal_position=2600)
@@ -102,7 +99,7 @@ def test_reverse_mode_mirrors_the_position_but_not_the_offset():
     assert bench.after(2.0) == 2600 and bench.servo.plant.position == 4096 - 2600
 
 
-def test_velocity_mode_turns_at_the_goal_velocity():
+def test_velocity_mode_turns_at_the_goal_velocity_and_keeps_the_profile_acceleration():
     bench = ServoBench(operating_mode=1)
     bench.put(torque_enable=1, goal_velocity=100)
     start = bench.after(1.0)
@@ -111,9 +108,6 @@ def test_velocity_mode_turns_at_the_goal_velocity():
     assert bench.after(0.0, "present_velocity") == 100
     bench.put(goal_velocity=0)
     assert bench.after(1.0, "present_velocity") == 0
-
-
-def test_velocity_mode_keeps_the_profile_acceleration():
     bench = ServoBench(operating_mode=1)
     bench.put(torque_enable=1, profile_acceleration=10, goal_velocity=200)
     rev_per_min2 = 10 * 214.577
@@ -155,13 +149,10 @@ def test_profile_by_time_arrives_in_that_time():
     assert bench.after(0.65) == pytest.approx(3000, abs=3)
 
 
-def test_torque_comes_on_with_a_goal_where_the_drive_mode_says_so():
+def test_a_goal_brings_torque_where_the_drive_mode_says_so_and_a_new_mode_resets_goals():
     bench = ServoBench(drive_mode=8)
     bench.put(goal_position=2100)
     assert bench.get("torque_enable") == 1 and bench.after(1.0) == 2100
-
-
-def test_changing_the_mode_resets_the_goals():
     bench = ServoBench(start=2300)
     bench.put(goal_position=3000, profile_velocity=50, operating_mode=4)
     assert (bench.get("goal_position"), bench.get("profile_velocity")) == (2300, 0)

@@ -25,16 +25,12 @@ def written(tmp_path, text):
     return file
 
 
-def test_links_are_where_joints_put_them(tmp_path):
+def test_links_shapes_sizes_and_colours_are_those_of_the_file(tmp_path):
     robot = read_urdf(written(tmp_path, TWO))
     places = robot.link_places({"turn": np.pi / 2})
     np.testing.assert_allclose(places["arm"][:3, 3], [1, 0, 0], atol=1e-12)
     along_y = 0.5 * np.pi / 2 + 0.1  # what mimics the quarter turn slides along the arm's x, which points to +y then
     np.testing.assert_allclose(places["slide"][:3, 3], [1, along_y, 0], atol=1e-12)
-
-
-def test_shapes_sizes_and_colours(tmp_path):
-    robot = read_urdf(written(tmp_path, TWO))
     box, ball = robot.visuals
     assert (box.shape, box.size, box.color) == ("box", (1, 2, 3), (1, 0, 0, 1))
     assert (ball.shape, ball.size, ball.place[2, 3]) == ("sphere", (0.5,), 1)

@@ -23,13 +23,15 @@ def test_a_track_frame_by_frame_is_the_track_as_a_whole():
     assert 0 < voiced.mean() < 1
 
 
-def test_mel_rows_stand_in_for_samples():
+def test_mel_rows_stand_in_for_samples_and_a_short_recording_has_no_frames():
     samples = voice(64)
     rows = mel.log_mel(samples, mel.start())[0].reshape(64, 4, 128)
     features, voiced = audio_frontend.of_mel(rows)
     assert features.shape == (64, 533)
     np.testing.assert_array_equal(features[:, :512], rows.reshape(64, 512))
     assert (voiced == audio_frontend.track(samples)[1]).mean() > 0.8
+    features, voiced = audio_frontend.track(np.zeros(639, np.float32))
+    assert features.shape == (0, 533) and voiced.shape == (0,)
 
 
 @pytest.mark.parametrize("samples", [None, np.zeros(0, np.float32)])
@@ -45,8 +47,3 @@ def test_a_frame_of_the_agent_is_cut_or_filled_up(samples: int):
     given = np.full(samples, 0.5, np.float32)
     fitted = audio_frontend.fit_frame(given)
     assert len(fitted) == FRAME_SAMPLES and fitted.sum() == 0.5 * min(samples, FRAME_SAMPLES)
-
-
-def test_a_short_recording_has_no_frames():
-    features, voiced = audio_frontend.track(np.zeros(639, np.float32))
-    assert features.shape == (0, 533) and voiced.shape == (0,)

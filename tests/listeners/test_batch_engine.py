@@ -18,13 +18,7 @@ from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.stream_server import StreamServer
-from sfms_robot.listeners.torch_engine import (
-    ONE_STREAM,
-    BatchEngine,
-    RecordingEngine,
-    networks_of,
-    torch_engine,
-)
+from sfms_robot.listeners.torch_engine import ONE_STREAM, BatchEngine, RecordingEngine, networks_of, torch_engine
 from sfms_robot.signals.control import COLUMNS
 
 TOLD = {"events": True, "draws": "innovation", "sway": True}
@@ -106,11 +100,15 @@ def test_a_batch_has_the_plans_of_each_stream_alone(kind, streams):
         np.testing.assert_allclose(plan, wanted, atol=1e-3)
 
 
-def test_what_an_engine_returned_stays_when_it_is_used_again():
+def test_what_an_engine_returned_stays_and_a_gpu_without_memory_is_said_in_one_line():
     engine = BatchEngine(nn.Identity(), {"same": Same()}, CPU)
     first = engine.run("same", np.ones((3, 2), np.float32))[0]
     engine.run("same", np.zeros((3, 2), np.float32))
     assert (first == 1).all()
+    engine = BatchEngine(nn.Identity(), {"same": Same()}, CPU)
+    with pytest.raises(MemoryError, match="^too little memory on the GPU for 5 heads at once$"):
+        engine.run("same", np.ones((5, 2), np.float32))
+    assert len(engine.run("same", np.ones((4, 2), np.float32))[0]) == 4
 
 
 class Same(nn.Module):
@@ -120,14 +118,7 @@ class Same(nn.Module):
         return (x,)
 
 
-def test_a_gpu_without_memory_is_said_in_one_line():
-    engine = BatchEngine(nn.Identity(), {"same": Same()}, CPU)
-    with pytest.raises(MemoryError, match="^too little memory on the GPU for 5 heads at once$"):
-        engine.run("same", np.ones((5, 2), np.float32))
-    assert len(engine.run("same", np.ones((4, 2), np.float32))[0]) == 4
-
-
-def test_a_batch_that_was_too_large_waits_and_comes_in_halves():
+def test_a_batch_that_was_too_large_comes_in_halves_and_one_such_stream_joins_again():
     server = StreamServer(Counting(), "counting")
     for client in "abcdef":
         server.receive(joined(server, client), frame(0), 0.0)
@@ -135,9 +126,6 @@ def test_a_batch_that_was_too_large_waits_and_comes_in_halves():
     server.too_many(batch)
     assert server.heads == 6
     assert len(server.batch()) == 3
-
-
-def test_one_stream_that_is_too_large_joins_again():
     server = StreamServer(Counting(), "counting")
     server.receive(joined(server, "a"), frame(0), 0.0)
     server.too_many(server.batch())

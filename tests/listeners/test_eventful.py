@@ -94,15 +94,12 @@ def test_memory_holds_what_is_under_way_and_no_more(lively):
     assert len(target_at([e for e in memory.when.done if e.target_rad], 21.0)) == 2
 
 
-def test_a_stream_that_begins_late_in_a_run_tells_times_of_the_run(lively):
+def test_a_stream_tells_times_of_the_run_and_at_hop_plans_as_often_and_decides_the_same(lively):
     later = [replace(frame, time_s=frame.time_s + 100.0) for frame in speech(200)]
     plans, _ = plans_of(lively, later)
     events = [event for plan in plans for event in plan.events]
     assert events and all(100.0 < event.start_s < 108.2 for event in events)
     assert frame_of(later[0]) == 2500
-
-
-def test_at_hop_plans_as_often_and_decides_the_same(lively):
     speaker = speech(240)
     two, four = plans_of(lively, speaker)[0], plans_of(lively.at_hop(4), speaker)[0]
     assert len(two) == 2 * len(four)

@@ -103,7 +103,6 @@ def test_the_heads_of_shipped_listeners_sway_as_far_as_people_do(name: str):
 
 
 # --- Idle motion of a face --------------------------------------------------------------------------------------------
-
 BROW = BLENDSHAPES.index("browInnerUp")
 
 
@@ -115,21 +114,18 @@ def made(size=0.02, spread=0.0, rest=0.0):
     return IdleMotion(loadings, amplitude, spread, held, held + np.float32(rest))
 
 
-def test_where_it_rests_is_added_once_it_has_set_in_and_no_face_leaves_its_range():
+def test_where_it_rests_is_added_once_it_has_set_in_but_not_to_a_mouth_that_speaks():
     stream = made(size=0.0, rest=-0.1).start(1)
     shown = stream.added(faces(3), np.array([0.0, EASE_S, 60.0]))[:, SHAPES]
     np.testing.assert_allclose(shown, np.array([0.5, 0.4, 0.4])[:, None] * np.ones((3, 52)), atol=1e-6)
     assert not stream.added(faces(1, 0.05), np.array([60.0]))[:, SHAPES].any()
-
-
-def test_a_mouth_that_speaks_is_not_where_it_rests_and_comes_back_there_after_its_voice():
     stream, silent_s = made(size=0.0, rest=-0.1).start(1), AFTER_SPEECH_S * np.array([0.0, 1.0, 1.5, 2.0, np.inf])
     shown = stream.added(faces(5), np.full(5, 60.0), silent_s)[:, SHAPES]
     np.testing.assert_allclose(shown[:, BLENDSHAPES.index("jawOpen")], [0.5, 0.5, 0.45, 0.4, 0.4], atol=1e-6)
     np.testing.assert_allclose(shown[:, BROW], 0.4, atol=1e-6)
 
 
-def test_a_map_takes_quantiles_to_quantiles_never_falls_and_beyond_them_moves_a_face_by_as_much_as_at_the_end():
+def test_a_map_takes_quantiles_to_quantiles_never_falls_and_moves_a_channel_that_never_varies_no_more():
     rng = np.random.default_rng(0)
     held, shown = np.sort(rng.uniform(0.2, 0.4, (2, KNOTS, len(BLENDSHAPES))), axis=1).astype(np.float32)
     rest = RestMap.between(held, shown)
@@ -137,9 +133,6 @@ def test_a_map_takes_quantiles_to_quantiles_never_falls_and_beyond_them_moves_a_
     grid = np.repeat(np.linspace(0, 1, 200, dtype=np.float32)[:, None], len(BLENDSHAPES), axis=1)
     assert np.diff(grid + rest.off(grid), axis=0).min() > -1e-6
     np.testing.assert_allclose(rest.off(grid)[[0, -1]], np.stack([shown[0] - held[0], shown[-1] - held[-1]]), atol=1e-6)
-
-
-def test_a_channel_that_never_varies_is_moved_and_no_more():
     held = np.full((KNOTS, len(BLENDSHAPES)), 0.3, np.float32)
     np.testing.assert_allclose(RestMap.between(held, held - 0.1).off(faces(3)[:, SHAPES]), -0.1, atol=1e-6)
 
@@ -199,14 +192,10 @@ def planned(hop, idle, said=range(0)):
 
 
 @pytest.mark.parametrize("hop", [2, 4])
-def test_a_listener_adds_it_to_every_plan_whatever_the_hop_and_nothing_else_changes(hop):
+def test_a_listener_adds_it_to_every_plan_whatever_the_hop_and_tells_it_of_its_own_voice(hop):
     for still, moving in zip(planned(hop, None), planned(hop, made(0.01)), strict=True):
         expected = made(0.01).start(5).added(still.frames, still.times_s)
         np.testing.assert_allclose(moving.frames, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("hop", [2, 4])
-def test_a_listener_tells_it_how_long_its_own_voice_has_been_silent(hop):
     idle, said = made(0.01, rest=0.02), range(40, 70)
     for still, moving in zip(planned(hop, None, said), planned(hop, idle, said), strict=True):
         newest = round(still.times_s[0] / FRAME_S) - 2
@@ -217,8 +206,6 @@ def test_a_listener_tells_it_how_long_its_own_voice_has_been_silent(hop):
 
 
 # --- Laws of both -----------------------------------------------------------------------------------------------------
-
-
 def of_sway(seed, times_s, spread=0.0):
     return sway_at(made_sway(seed, spread=spread), times_s).astype(np.float64)
 
@@ -245,9 +232,15 @@ def test_piece_by_piece_it_is_the_whole(motion, size, fastest_hz, chunk):
 
 
 @BOTH
-def test_it_sets_in_from_rest(motion, size, fastest_hz):
+def test_it_sets_in_from_rest_no_faster_than_its_bands_and_each_stream_goes_its_own_way(motion, size, fastest_hz):
     out = np.abs(motion(1, np.array([-1.0, 0.0, EASE_S / 100, EASE_S, 60.0]))).max(1)
     assert not out[:2].any() and out[2] < 1e-4 < out[3:].max()
+    moved = motion(2, 10 + np.arange(5000) * 0.04)
+    power, hz = np.square(np.abs(np.fft.rfft(moved - moved.mean(0), axis=0))).sum(1), np.fft.rfftfreq(5000, 0.04)
+    assert power[hz > fastest_hz].sum() < 0.01 * power.sum()
+    times_s = 10 + np.arange(3000) * 0.2
+    together = np.corrcoef(np.concatenate([motion(1, times_s), motion(2, times_s)], axis=1).T)
+    assert np.abs(together - np.eye(len(together))).max() < 0.4
 
 
 @BOTH
@@ -257,17 +250,3 @@ def test_its_size_is_what_was_asked_also_after_an_hour_and_people_differ_by_the_
         assert float(np.std(found)) == pytest.approx(size, rel=0.05)
     sizes = [np.log(motion(seed, 10 + np.arange(300) * 1.7, spread=0.5).std()) for seed in range(60)]
     assert 0.3 < float(np.std(sizes)) < 0.65
-
-
-@BOTH
-def test_it_is_no_faster_than_its_bands(motion, size, fastest_hz):
-    moved = motion(2, 10 + np.arange(5000) * 0.04)
-    power, hz = np.square(np.abs(np.fft.rfft(moved - moved.mean(0), axis=0))).sum(1), np.fft.rfftfreq(5000, 0.04)
-    assert power[hz > fastest_hz].sum() < 0.01 * power.sum()
-
-
-@BOTH
-def test_streams_and_channels_go_their_own_ways(motion, size, fastest_hz):
-    times_s = 10 + np.arange(3000) * 0.2
-    together = np.corrcoef(np.concatenate([motion(1, times_s), motion(2, times_s)], axis=1).T)
-    assert np.abs(together - np.eye(len(together))).max() < 0.4

@@ -117,13 +117,10 @@ def test_a_listener_without_graphs_runs_on_torch_unless_onnx_is_asked_for(copied
     assert engine_name(load_listener(copied)) == "torch"
 
 
-def test_a_manifest_that_is_none_is_refused(copied):
+def test_a_manifest_that_is_none_is_refused_and_with_auto_leaves_the_listener_to_torch(copied, caplog):
     for text in ("[]", "{", json.dumps({"format": 99, "settings": "", "networks": {}, "tensors": {}})):
         (copied / "onnx" / "graphs.json").write_text(text)
         assert "graphs.json: " in refused(copied)
-
-
-def test_with_auto_graphs_that_do_not_fit_leave_the_listener_to_torch(copied, caplog):
     (copied / "onnx" / "graphs.json").write_text("{")
     assert engine_name(load_listener(copied)) == "torch"
     assert "torch in place of onnx" in caplog.text

@@ -99,16 +99,13 @@ def test_an_event_is_told_once_though_it_is_sent_with_three_plans_and_some_are_l
     assert len(told) >= 0.95 * sum(len(plan.events) for _, plan in lossless.plans)
 
 
-def test_a_refusal_for_good_ends_the_start_with_both_sides_named():
+def test_a_refusal_for_good_or_another_version_ends_the_start_with_both_sides_named(caplog):
     head = robot()
     head.link.ask = lambda message: head.link.arrived(
         words_message(Refusal("this robot is A; server b is B", final=True))
     )
     with pytest.raises(ConfigError, match="zenoh/counting: this robot is A; server b is B"):
         head.feed.wait_loaded(1.0)
-
-
-def test_a_server_of_another_version_is_refused_by_the_robot_too(caplog):
     head = robot()
     told = json.loads(head.server.core.join(asking(head), 0.0)) | {}
     told["interface"]["motion"] = "deca56"
@@ -149,25 +146,19 @@ def test_random_bytes_from_a_server_are_counted_and_said_once(caplog):
     assert not head.feed.lost
 
 
-def test_calmness_reaches_the_stream():
+def test_calmness_reaches_the_stream_what_was_left_out_is_counted_and_close_says_goodbye():
     head = robot().run(1.0)
     head.feed.calm(Calmness(nod=5.0))
     heeded = []
     head.server.core._listener.calmed = lambda memory, calmness: heeded.append(calmness) or memory
     head.run(0.2)
     assert heeded == [Calmness(nod=5.0)]
-
-
-def test_close_says_goodbye():
+    head = robot().run(1.0)
+    head.link.arrived(words_message(Notice("skipped", frames=7)))
+    head.run(0.1)
+    assert figures(head)["skipped_frames"] >= 7
     head = robot().run(1.0)
     head.feed.close()
     head.network.advance(2.0)
     assert head.server.core.heads == 0 and head.link.closed
     head.feed.close()
-
-
-def test_what_a_server_left_out_is_counted():
-    head = robot().run(1.0)
-    head.link.arrived(words_message(Notice("skipped", frames=7)))
-    head.run(0.1)
-    assert figures(head)["skipped_frames"] >= 7

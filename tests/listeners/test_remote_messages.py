@@ -12,21 +12,7 @@ from same import same
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import EVENT_KINDS, FaceFrame, ListenerEvent, Plan, SpeakerFrame
-from sfms_robot.listeners.remote_messages import (
-    OURS,
-    Join,
-    Notice,
-    Refusal,
-    SentFrame,
-    SentPlan,
-    Welcome,
-    frame_message,
-    parse_frame,
-    parse_plan,
-    parse_words,
-    plan_message,
-    words_message,
-)
+from sfms_robot.listeners import remote_messages as messages
 
 TIMES = st.floats(0, 1e6, width=64)
 
@@ -62,66 +48,70 @@ def plans(draw):
 
 
 def sent_plan(plan):
-    return SentPlan(number=0, plan=plan, echo_s=1.0, came_s=1.0, sent_s=1.0, step_ms=1.0)
+    return messages.SentPlan(number=0, plan=plan, echo_s=1.0, came_s=1.0, sent_s=1.0, step_ms=1.0)
 
 
 @given(st.integers(0, 2**31 - 1), FRAMES, TIMES, TIMES | st.just(math.nan))
 def test_a_frame_comes_as_it_was_sent(number, frame, sent_s, server_s):
-    sent = SentFrame(number, frame, sent_s, server_s)
-    assert same(parse_frame(frame_message(sent)), sent)
+    sent = messages.SentFrame(number, frame, sent_s, server_s)
+    assert same(messages.parse_frame(messages.frame_message(sent)), sent)
 
 
 @given(SEEDS.map(lambda rng: rng.uniform(-1, 1, 640).astype(np.float32)))
 def test_sound_loses_half_a_step_of_a_sound_card_at_most(audio):
-    heard = parse_frame(frame_message(SentFrame(0, SpeakerFrame(0.04, audio), 0.0))).frame.audio
+    heard = messages.parse_frame(
+        messages.frame_message(messages.SentFrame(0, SpeakerFrame(0.04, audio), 0.0))
+    ).frame.audio
     assert np.abs(heard - audio).max() <= 1 / 32768
 
 
 @given(st.integers(0, 2**31 - 1), plans(), TIMES, TIMES, TIMES, st.floats(0, 1e4, width=32))
 def test_a_plan_comes_as_it_was_made(number, plan, echo_s, came_s, sent_s, step_ms):
-    sent = SentPlan(number=number, plan=plan, echo_s=echo_s, came_s=came_s, sent_s=sent_s, step_ms=step_ms)
-    assert same(parse_plan(plan_message(sent)), sent)
+    sent = messages.SentPlan(number=number, plan=plan, echo_s=echo_s, came_s=came_s, sent_s=sent_s, step_ms=step_ms)
+    assert same(messages.parse_plan(messages.plan_message(sent)), sent)
 
 
 @given(plans(), st.tuples(EVENTS, EVENTS))
 def test_a_plan_tells_the_events_of_plans_before_it_first(plan, earlier):
-    told = parse_plan(plan_message(sent_plan(plan), earlier)).plan
+    told = messages.parse_plan(messages.plan_message(sent_plan(plan), earlier)).plan
     assert told.events == (*earlier, *plan.events)
 
 
 @pytest.mark.parametrize(
     "said",
     [
-        Join("a", 3), Join("a", 3, {"nod": 2.0}),
-        Welcome(stream="s", server="big-1", listener="sfms-small", horizon=8, hop=3), Refusal("full", False),
-        Notice("skipped", 3), Notice("calm", calmness={"nod": 1.0}),
+        messages.Join("a", 3), messages.Join("a", 3, {"nod": 2.0}),
+        messages.Welcome(stream="s", server="big-1", listener="sfms-small", horizon=8, hop=3),
+        messages.Refusal("full", False), messages.Notice("skipped", 3), messages.Notice("calm", calmness={"nod": 1.0}),
     ],
 )  # fmt: skip
 def test_words_come_as_they_were_said(said):
-    assert parse_words(words_message(said)) == said
+    assert messages.parse_words(messages.words_message(said)) == said
 
 
 def whole_messages():
     frame = SpeakerFrame(0.04, np.zeros(640, np.float32), FaceFrame.of(0.0, np.zeros(58)))
     plan = Plan(0.04, np.array([0.08]), np.zeros((1, 58), np.float32))
     return [
-        (parse_frame, frame_message(SentFrame(0, frame, 1.0))),
-        (parse_plan, plan_message(sent_plan(plan))),
+        (messages.parse_frame, messages.frame_message(messages.SentFrame(0, frame, 1.0))),
+        (messages.parse_plan, messages.plan_message(sent_plan(plan))),
     ]
 
 
 @pytest.mark.parametrize(("parse", "message"), whole_messages(), ids=["frame", "plan"])
-def test_a_message_that_is_cut_short_or_too_long_is_none(parse, message):
+def test_a_message_that_is_cut_short_too_long_or_of_another_protocol_is_none(parse, message):
     for end in range(len(message)):
         with pytest.raises(PacketError):
             parse(message[:end])
     with pytest.raises(PacketError, match="1 bytes too many"):
         parse(message + b"x")
+    with pytest.raises(PacketError, match="got protocol 2"):
+        parse(message[:1] + b"\x02" + message[2:])
 
 
 @given(st.binary(max_size=300))
 def test_random_bytes_are_refused_in_one_line(data):
-    for parse in (parse_frame, parse_plan, parse_words):
+    for parse in (messages.parse_frame, messages.parse_plan, messages.parse_words):
         with pytest.raises(PacketError):
             parse(data)
     for parse, message in whole_messages():
@@ -132,23 +122,14 @@ def test_random_bytes_are_refused_in_one_line(data):
             assert "\n" not in str(error)
 
 
-@pytest.mark.parametrize(("parse", "message"), whole_messages(), ids=["frame", "plan"])
-def test_a_message_of_another_protocol_is_named(parse, message):
-    with pytest.raises(PacketError, match="got protocol 2"):
-        parse(message[:1] + b"\x02" + message[2:])
-
-
-def test_interfaces_fit_whatever_the_version_of_the_program_and_nothing_else():
-    assert OURS.fits(replace(OURS, version="9.9"))
-    assert not OURS.fits(replace(OURS, motion="deca56"))
-    assert not OURS.fits(replace(OURS, protocol=2))
-    assert not OURS.fits(replace(OURS, frame_hz=30))
-
-
-def test_words_of_a_later_protocol_are_still_read_as_far_as_they_are_named():
-    told = json.loads(words_message(Join("a", 0)))
+def test_interfaces_fit_whatever_the_version_and_words_of_a_later_protocol_are_read_as_far_as_named():
+    assert messages.OURS.fits(replace(messages.OURS, version="9.9"))
+    assert not messages.OURS.fits(replace(messages.OURS, motion="deca56"))
+    assert not messages.OURS.fits(replace(messages.OURS, protocol=2))
+    assert not messages.OURS.fits(replace(messages.OURS, frame_hz=30))
+    told = json.loads(messages.words_message(messages.Join("a", 0)))
     told["interface"] |= {"protocol": 7, "colour": "red"}
-    said = parse_words(json.dumps(told).encode())
+    said = messages.parse_words(json.dumps(told).encode())
     assert said.interface.protocol == 7
 
 
@@ -162,4 +143,4 @@ def test_words_of_a_later_protocol_are_still_read_as_far_as_they_are_named():
 )  # fmt: skip
 def test_words_that_are_none_are_refused(told):
     with pytest.raises(PacketError):
-        parse_words(told.encode())
+        messages.parse_words(told.encode())

@@ -23,8 +23,17 @@ def test_the_offset_is_found_within_the_jitter_of_the_quickest(offset_s):
     assert abs(clock.best.offset_s - offset_s) <= clock.best.delay_s / 2
 
 
-def test_nothing_is_known_before_the_first():
+def test_a_clock_is_unknown_before_the_first_bounded_in_memory_and_believed_at_once_when_it_was_set():
     assert ClockOffset().best is None and ClockOffset().theirs(3.0) is None
+    clock = ClockOffset()
+    for index in range(50):
+        exchange(clock, index * 0.04, 0.0, 0.01, 0.01)
+    exchange(clock, 2.0, 3600.0, 0.03, 0.03)
+    assert clock.theirs(2.1) == pytest.approx(3602.1)
+    clock = ClockOffset()
+    for index in range(10_000):
+        exchange(clock, index * 0.04, 0.0, 0.01 + 1e-6 * index, 0.01)
+    assert len(clock._samples) <= WINDOW_S / 0.04 + 2
 
 
 def test_a_clock_that_drifts_is_followed():
@@ -32,21 +41,6 @@ def test_a_clock_that_drifts_is_followed():
     for index in range(5000):
         exchange(clock, index * 0.04, index * 0.04 * 1e-4, 0.02, 0.02)
     assert clock.theirs(200.0) == pytest.approx(200.0 + 200.0 * 1e-4, abs=2 * WINDOW_S * 1e-4)
-
-
-def test_a_server_whose_clock_was_set_is_believed_at_once():
-    clock = ClockOffset()
-    for index in range(50):
-        exchange(clock, index * 0.04, 0.0, 0.01, 0.01)
-    exchange(clock, 2.0, 3600.0, 0.03, 0.03)
-    assert clock.theirs(2.1) == pytest.approx(3602.1)
-
-
-def test_memory_is_bounded_by_the_window():
-    clock = ClockOffset()
-    for index in range(10_000):
-        exchange(clock, index * 0.04, 0.0, 0.01 + 1e-6 * index, 0.01)
-    assert len(clock._samples) <= WINDOW_S / 0.04 + 2
 
 
 def plan(number, horizon, events=()):
@@ -85,12 +79,18 @@ def longest_gap_s(given):
     return gap_s
 
 
-def test_a_long_plan_that_comes_in_time_is_left_as_it_is():
+def test_a_long_plan_that_comes_in_time_is_left_as_it_is_and_doubles_are_given_once():
     buffer = JitterBuffer(8, 3)
     one = plan(0, 8)
     buffer.put(0, one, one.made_at_s + 0.05)
     assert buffer.take(0.1) == [one]
     assert buffer.shift_s == 0.0
+    buffer = JitterBuffer(8, 3)
+    for _ in range(3):
+        buffer.put(0, plan(0, 8), 0.1)
+    assert len(buffer.take(0.1)) == 1
+    buffer.put(0, plan(0, 8), 0.12)
+    assert buffer.take(0.12) == [] and buffer.doubled == 3
 
 
 @pytest.mark.parametrize(("horizon", "hop"), [(8, 2), (8, 3), (8, 4), (1, 1)])
@@ -109,15 +109,12 @@ def test_a_plan_that_is_lost_leaves_a_gap_of_120_ms_at_most(seed):
     assert longest_gap_s(played(JitterBuffer(8, 3), arrivals, 20.0)) <= 0.120
 
 
-def test_plans_that_overtook_one_another_are_given_in_order():
+def test_plans_that_overtook_one_another_are_given_in_order_and_a_missing_one_is_waited_for():
     buffer = JitterBuffer(8, 1)
     for number, came_s in [(0, 0.1), (2, 0.14), (1, 0.15), (3, 0.2)]:
         buffer.put(number, plan(number, 8), came_s)
     given = [each.made_at_s for _, each in played(buffer, [], 0.5)]
     assert given == sorted(given) and len(given) == 4
-
-
-def test_a_missing_plan_is_waited_for_until_the_next_one_is_due():
     buffer = JitterBuffer(8, 3)
     buffer.put(0, plan(0, 8), 0.05)
     assert len(buffer.take(0.05)) == 1
@@ -129,16 +126,7 @@ def test_a_missing_plan_is_waited_for_until_the_next_one_is_due():
     assert buffer.take(0.34) == [] and buffer.late == 1
 
 
-def test_doubles_are_given_once():
-    buffer = JitterBuffer(8, 3)
-    for _ in range(3):
-        buffer.put(0, plan(0, 8), 0.1)
-    assert len(buffer.take(0.1)) == 1
-    buffer.put(0, plan(0, 8), 0.12)
-    assert buffer.take(0.12) == [] and buffer.doubled == 3
-
-
-def test_the_shift_shrinks_slowly_when_the_way_gets_better():
+def test_the_shift_shrinks_slowly_and_an_outage_does_not_make_all_plans_late():
     buffer = JitterBuffer(1, 1)
     played(buffer, jittered(1, 1, 0.3, 0.0, frames=100), 5.0)
     before_s = buffer.shift_s
@@ -147,9 +135,6 @@ def test_the_shift_shrinks_slowly_when_the_way_gets_better():
         buffer.put(number, one, came_s)
         buffer.take(came_s)
     assert before_s > 0.3 and before_s - 8.0 * SHRINKS - 0.01 <= buffer.shift_s < before_s
-
-
-def test_an_outage_does_not_make_all_plans_late():
     buffer = JitterBuffer(1, 1)
     played(buffer, jittered(1, 1, 0.05, 0.0, frames=100), 5.0)
     before_s = buffer.shift_s

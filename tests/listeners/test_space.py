@@ -31,7 +31,7 @@ def test_our_motion_survives_the_way_into_a_space_and_back(name):
     assert back == pytest.approx(faces(), abs=1e-5)
 
 
-def test_deca_keeps_pose_and_jaw_and_says_what_it_cannot_show():
+def test_deca_keeps_pose_and_jaw_and_rest_in_every_space_is_a_face_at_rest():
     deca = space("deca56")
     back, jaw = deca.decode(deca.encode(faces()))
     assert back[:, :3] == pytest.approx(faces()[:, :3], abs=1e-5)
@@ -39,9 +39,6 @@ def test_deca_keeps_pose_and_jaw_and_says_what_it_cannot_show():
     assert jaw is not None and jaw.shape == (20, 3)
     assert "pose and jaw only" in deca.limitation
     assert space("faceverse58").limitation is None
-
-
-def test_rest_in_every_space_is_a_face_at_rest():
     for name in SPACE_CHANNELS:
         at_rest = space(name)
         assert at_rest.decode(at_rest.neutral[None].astype(np.float32))[0] == pytest.approx(np.zeros((1, 58)), abs=1e-6)

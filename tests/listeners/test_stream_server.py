@@ -9,32 +9,22 @@ from remote_rig import SILENCE, Counting, Network, Robot, Server
 from tiny_sfms import plans_of, speech, tiny_listener
 
 from sfms_robot.frames import FRAME_S, SpeakerFrame
+from sfms_robot.listeners import remote_messages as messages
 from sfms_robot.listeners.capacity import Capacity, measure_capacity
-from sfms_robot.listeners.remote_messages import (
-    OURS,
-    Join,
-    Notice,
-    SentFrame,
-    Welcome,
-    frame_message,
-    parse_plan,
-    parse_words,
-    words_message,
-)
 from sfms_robot.listeners.stream_server import DEADLINE_S, SILENT_S, StreamServer, report
 from sfms_robot.listeners.thread import MOST_WAITING
 
-LEAVE = words_message(Notice("leave"))
+LEAVE = messages.words_message(messages.Notice("leave"))
 
 
 def joined(server, client="a", now_s=0.0, seed=0):
-    said = parse_words(server.join(words_message(Join(client, seed)), now_s))
-    assert isinstance(said, Welcome), said
+    said = messages.parse_words(server.join(messages.words_message(messages.Join(client, seed)), now_s))
+    assert isinstance(said, messages.Welcome), said
     return said.stream
 
 
 def frame(number, audio=SILENCE):
-    return frame_message(SentFrame(number, SpeakerFrame((number + 1) * FRAME_S, audio), 0.0))
+    return messages.frame_message(messages.SentFrame(number, SpeakerFrame((number + 1) * FRAME_S, audio), 0.0))
 
 
 def stepped(server, now_s=0.0):
@@ -42,20 +32,17 @@ def stepped(server, now_s=0.0):
     plans = []
     while (batch := server.batch()) is not None:
         for stream, message in server.finish(batch, server.step(batch), now_s, now_s):
-            plans.append((stream, parse_plan(message)))
+            plans.append((stream, messages.parse_plan(message)))
     return plans
 
 
-def test_all_who_are_due_are_one_batch():
+def test_all_who_are_due_are_one_batch_in_which_one_who_sends_all_at_once_has_one_place():
     listener = Counting()
     server = StreamServer(listener, "counting")
     for client in "abcde":
         server.receive(joined(server, client), frame(0), 0.0)
     assert len(stepped(server)) == 5
     assert listener.sizes == [5]
-
-
-def test_one_who_sends_all_at_once_has_one_place_in_each_batch():
     listener = Counting()
     server = StreamServer(listener, "counting")
     greedy, modest = joined(server, "a"), joined(server, "b")
@@ -87,17 +74,14 @@ def test_streams_in_a_batch_are_in_no_other_until_it_is_finished():
     assert server.waits
 
 
-def test_memory_of_a_stream_is_bounded_and_what_is_left_out_is_told():
+def test_memory_of_a_stream_is_bounded_and_frames_late_or_twice_are_not_stepped_twice():
     server = StreamServer(Counting(), "counting")
     stream, notices = joined(server), []
     for number in range(500):
         notices += server.receive(stream, frame(number), 0.0)
     assert len(server._streams[stream].waiting) <= MOST_WAITING
-    left_out = sum(parse_words(each).frames for each in notices)
+    left_out = sum(messages.parse_words(each).frames for each in notices)
     assert left_out == server.counts["skipped_frames"] == 500 - len(server._streams[stream].waiting)
-
-
-def test_frames_that_come_late_or_twice_are_not_stepped_twice():
     server = StreamServer(Counting(), "counting")
     stream = joined(server)
     for number in (0, 2, 1, 2, 3):
@@ -117,8 +101,8 @@ def test_heads_come_and_go_at_any_frame_and_each_hears_what_it_would_alone():
             if now == first:
                 streams[index] = joined(server, str(index), seed=index)
             if index in streams and now - first < 24:
-                sent = SentFrame(now - first, people[index][now - first], 0.0)
-                server.receive(streams[index], frame_message(sent), 0.0)
+                sent = messages.SentFrame(now - first, people[index][now - first], 0.0)
+                server.receive(streams[index], messages.frame_message(sent), 0.0)
         if now == 20:  # one goes
             server.receive(streams[1], LEAVE, 0.0)
         for stream, sent in stepped(server):
@@ -142,33 +126,30 @@ def test_who_is_silent_is_given_up_and_told_when_it_speaks_again():
     server.expire(SILENT_S + 0.1)
     assert server.heads == 0
     (answer,) = server.receive(stream, frame(0), 20.0)
-    assert parse_words(answer).kind == "unknown"
+    assert messages.parse_words(answer).kind == "unknown"
 
 
-def test_who_asks_again_keeps_its_stream():
+def test_who_asks_again_keeps_its_stream_and_calmness_that_cannot_be_is_refused():
     server = StreamServer(Counting(), "counting")
     assert joined(server, "a") == joined(server, "a") and server.heads == 1
+    server = StreamServer(Counting(), "counting")
+    refusal = messages.parse_words(server.join(messages.words_message(messages.Join("a", 0, {"nod": 1e9})), 0.0))
+    assert refusal.final and "nod" in refusal.reason
 
 
 @pytest.mark.parametrize("changed", [{"motion": "deca56", "channels": ("x",)}, {"protocol": 2}, {"frame_hz": 30}])
 def test_a_robot_of_another_kind_is_refused_with_both_sides_named(changed):
     server = StreamServer(Counting(), "counting", server="big")
-    interface = replace(OURS, version="9.9", **changed)
-    refusal = parse_words(server.join(words_message(Join("a", 0, None, interface)), 0.0))
+    interface = replace(messages.OURS, version="9.9", **changed)
+    refusal = messages.parse_words(server.join(messages.words_message(messages.Join("a", 0, None, interface)), 0.0))
     assert refusal.final and "sfms-robot 9.9" in refusal.reason and "server big" in refusal.reason
     assert server.counts["refused"] == 1 and server.heads == 0
 
 
 @pytest.mark.parametrize("message", [b"", b"{}", b"\x00\x01", b'{"type": "join", "client": "a", "seed": "x"}'])
 def test_nonsense_is_refused(message):
-    refusal = parse_words(StreamServer(Counting(), "counting").join(message, 0.0))
+    refusal = messages.parse_words(StreamServer(Counting(), "counting").join(message, 0.0))
     assert refusal.final and "cannot take that" in refusal.reason
-
-
-def test_calmness_that_cannot_be_is_refused_with_its_key():
-    server = StreamServer(Counting(), "counting")
-    refusal = parse_words(server.join(words_message(Join("a", 0, {"nod": 1e9})), 0.0))
-    assert refusal.final and "nod" in refusal.reason
 
 
 def test_random_bytes_to_a_stream_are_not_stepped_but_counted_and_the_first_is_logged(caplog):
@@ -183,8 +164,6 @@ def test_random_bytes_to_a_stream_are_not_stepped_but_counted_and_the_first_is_l
 
 
 # --- admission -------------------------------------------------------------------------------------------------------
-
-
 def slow(scale):
     """A millisecond a head and five for any batch, times `scale`."""
     sizes = (1, 2, 4, 8, 16)
@@ -201,7 +180,7 @@ def test_heads_are_admitted_until_the_deadline_cannot_be_held_and_the_reason_has
     server = StreamServer(Counting(), "counting", capacity)
     for index in range(capacity.most(DEADLINE_S)):
         joined(server, str(index))
-    refusal = parse_words(server.join(words_message(Join("one more", 0)), 0.0))
+    refusal = messages.parse_words(server.join(messages.words_message(messages.Join("one more", 0)), 0.0))
     assert not refusal.final and "is full" in refusal.reason and "80 ms are promised" in refusal.reason
     gone = next(iter(server._streams))
     server.receive(gone, LEAVE, 0.0)

@@ -17,16 +17,12 @@ def joint(**changes) -> Joint:
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_ticks_and_back_is_within_half_a_tick(seed):
+def test_ticks_and_back_is_within_half_a_tick_and_every_tick_comes_back_as_itself(seed):
     low = np.maximum(FACE.to_rad(FACE.low_ticks), FACE.to_rad(FACE.high_ticks))
     high = np.minimum(FACE.to_rad(FACE.low_ticks), FACE.to_rad(FACE.high_ticks))
     angles = np.random.default_rng(seed).uniform(np.minimum(low, high), np.maximum(low, high))
     error_ticks = (FACE.to_rad(FACE.to_ticks(angles)) - angles) * FACE.ticks_per_rad
     assert np.abs(error_ticks).max() <= 0.5 + 1e-9
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_every_tick_comes_back_as_itself(seed):
     ticks = np.random.default_rng(seed).integers(FACE.low_ticks, FACE.high_ticks + 1)
     assert np.array_equal(FACE.to_ticks(FACE.to_rad(ticks)), ticks)
 
@@ -39,14 +35,11 @@ def test_no_angle_leads_to_a_tick_outside_the_limits():
         assert (reached >= low - 1e-9).all() and (reached <= high + 1e-9).all()
 
 
-def test_sign_ratio_and_zero():
+def test_sign_ratio_and_zero_hold_inside_and_outside_the_limits():
     two = {"a": joint(zero_ticks=1000), "b": joint(zero_ticks=3000, sign=-1, ratio=2.0)}
     calibration = Calibration(two, np.array([3600, 7200]))
     assert calibration.to_ticks(np.radians([9.0, 9.0])).tolist() == [1000 + 90, 3000 - 360]
     assert np.degrees(calibration.to_rad(np.array([1050, 3400]))) == pytest.approx([5.0, -10.0])
-
-
-def test_a_position_outside_the_limits_is_told_as_it_is():
     calibration = Calibration({"a": joint()}, np.array([4096]))
     assert np.degrees(calibration.to_rad(np.array([3072]))) == pytest.approx([90.0])
 

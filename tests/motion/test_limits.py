@@ -101,9 +101,28 @@ def test_a_slow_nod_passes_unchanged():
 
 def test_what_is_not_finite_is_refused_and_the_joint_comes_to_a_stop():
     moving = [np.stack([LIMITS.speed * 0.2 * DT_S * k, LIMITS.speed * 0.2, 0 * LIMITS.speed]) for k in range(4)]
-    sent, state = followed([*moving, *[np.full((3, J), np.nan)] * 60])
-    assert excess(sent) < 1e-6 and state.refused == 60 * J
-    assert not np.diff(sent[-20:], axis=0).any() and not state.motion[1:].any()
+    for row in range(3):  # angle, speed, acceleration
+        lost = np.where(np.arange(3)[:, None] == row, np.nan, np.zeros((3, J)))
+        sent, state = followed([*moving, *[lost] * 60])
+        assert excess(sent) < 1e-6 and state.refused == 60 * J
+        assert not np.diff(sent[-20:], axis=0).any() and not state.motion[1:].any()
+
+
+def test_a_steady_reference_that_goes_on_past_the_range_is_left_before_its_end():
+    path = LIMITS.high - 0.301 + 0.3 * DT_S * np.arange(130)[:, None]
+    start = np.clip(path[0], LIMITS.low, LIMITS.high)
+    assert excess(followed([difference(*path[k : k + 3], DT_S) for k in range(128)], start)[0]) < 1e-6
+
+
+def test_acceleration_between_two_samples_counts_too():
+    """It is highest two thirds through each of the last ticks, which begin and end just below its limit."""
+    (p, v, a), h, references = np.zeros((3, J)), DT_S / 3, []
+    ramp, most = 0.999 * LIMITS.acceleration / (4 * DT_S), 0.9 * LIMITS.jerk
+    for jerks in [(ramp, ramp, ramp)] * 4 + [(0 * most, most, -most)] * 4:
+        for j in jerks:
+            p, v, a = p + v * h + a * h**2 / 2 + j * h**3 / 6, v + a * h + j * h**2 / 2, a + j * h
+        references.append(np.stack([p, v, a]))
+    assert excess(followed([*references, *[standing(0.0)] * 60])[0]) < 1e-6
 
 
 def test_one_broken_joint_does_not_disturb_the_others():
@@ -142,7 +161,6 @@ def test_the_reference_of_a_parabola_is_exact():
 
 
 # --- with and without ruckig ------------------------------------------------------------------------------------
-
 RATES = (3.0, 30.0, 1500.0)  # speed, acceleration, jerk
 ONE = JointLimits(np.array([-2.0]), np.array([2.0]), *(np.array([rate]) for rate in RATES))
 

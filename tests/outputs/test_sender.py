@@ -54,17 +54,11 @@ def played(sender, frame, start_s, seconds, **more):
     return np.array([each.motion[YAW] for each in sender.output.frames[-round(seconds * HZ) :]])
 
 
-def test_motion_begins_at_neutral_and_arrives_after_the_easing():
+def test_motion_begins_and_ends_at_neutral_and_arrives_after_the_easing():
     yaw = played(OutputSender(Peer()), looking(), 0.0, EASE_S + 0.1)
     assert yaw[0] == 0.0 and yaw[-1] == pytest.approx(0.4)
     assert np.abs(np.diff(yaw)).max() < 0.4 * 1.9 / HZ / EASE_S
-
-
-def test_before_the_first_tick_an_output_is_neutral():
     assert not played(OutputSender(Peer()), None, 0.0, 0.2).any()
-
-
-def test_the_end_eases_to_neutral():
     sender = OutputSender(Peer())
     played(sender, looking(), 0.0, 2.0)
     assert not sender.settled
@@ -72,15 +66,12 @@ def test_the_end_eases_to_neutral():
     assert yaw[0] == pytest.approx(0.4) and yaw[-1] == 0.0 and sender.settled
 
 
-def test_an_avatar_goes_neutral_in_a_halt_and_comes_back_after_it():
+def test_in_a_halt_an_avatar_goes_neutral_and_a_machine_brakes_and_holds_its_pose():
     sender = OutputSender(Peer())
     played(sender, looking(), 0.0, 2.0)
     assert played(sender, looking(0.0, "halted"), 2.0, 1.2)[-1] == 0.0
     yaw = played(sender, looking(), 4.0, 1.2)
     assert yaw[0] == 0.0 and yaw[-1] == pytest.approx(0.4)
-
-
-def test_a_machine_brakes_in_a_halt_holds_its_pose_and_is_not_moved_at_the_end():
     sender = OutputSender(Peer(True, LIMITS))
     played(sender, looking(0.4), 0.0, 0.5)  # on its way
     yaw = played(sender, looking(0.0, "halted"), 0.5, 2.0).astype(float)
@@ -196,12 +187,9 @@ def test_what_is_not_an_address_is_refused_in_one_line(text):
         parse_address("vmc", text, 7)
 
 
-def test_an_unknown_kind_names_the_kinds():
+def test_a_kind_that_gives_no_output_is_refused(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"^--output vcm: expected KIND or KIND:ADDRESS \(valid: json, vmc"):
         open_output("vcm")
-
-
-def test_a_plug_in_that_gives_no_output_is_refused(tmp_path, monkeypatch):
     (tmp_path / "odd-1.0.dist-info").mkdir()
     (tmp_path / "odd-1.0.dist-info" / "entry_points.txt").write_text("[sfms_robot.outputs]\nodd = builtins:list\n")
     monkeypatch.syspath_prepend(str(tmp_path))

@@ -130,8 +130,6 @@ def answered(output, frame, now_s=0.0, opens=False, step_s=0.0):
 
 
 # --- Encoding ---------------------------------------------------------------------------------------------------------
-
-
 def test_antennas_and_body_move_as_those_of_the_shipped_head():
     head = load_head("reachy_mini")
     retargeter = HeadRetargeter(head)
@@ -196,8 +194,6 @@ def test_one_program_gets_one_output(plain, kind):
 
 
 # --- What moves a machine ---------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mover", MOVERS)
 def test_a_step_is_limited_and_a_halt_holds(mover):
     output = mover("127.0.0.1:1")
@@ -217,10 +213,7 @@ def test_a_step_is_limited_and_a_halt_holds(mover):
 
 
 def daemon(status=AWAKE, lock="free", answer=lambda message: (AWAKE, HOME)):
-    pages = {
-        "/api/daemon/status": status,
-        "/api/daemon/robot-app-lock-status": {"state": lock, "holder_name": "radio"},
-    }
+    pages = {"/api/daemon/status": status, "/api/daemon/robot-app-lock-status": {"state": lock, "holder_name": "radio"}}
     return Fake(answer, pages)
 
 
@@ -290,8 +283,6 @@ def test_an_offset_is_eased_away_after_a_break_of_the_network_alone(gone):
 
 
 # --- Furhat -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.usefixtures("quick")
 def test_furhat_is_taken_over_and_given_back(monkeypatch):
     monkeypatch.setenv("FURHAT_KEY", "secret")
@@ -314,8 +305,6 @@ def test_furhat_is_taken_over_and_given_back(monkeypatch):
 
 
 # --- VTube Studio -----------------------------------------------------------------------------------------------------
-
-
 class Studio:
     """Answers of VTube Studio."""
 
@@ -400,7 +389,6 @@ def test_a_refusal_of_vtube_studio_is_one_line(tmp_path, answers, line):
 
 
 # --- Bad peers --------------------------------------------------------------------------------------------------------
-
 GREETING = b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: "
 NOT_FOUND = b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"
 

@@ -46,14 +46,11 @@ def test_a_jump_takes_as_long_as_a_human_saccade_and_stays_where_it_lands(size_d
     assert path[0] == 0 and path[-1] == pytest.approx(size_deg) and np.all(np.diff(path) >= 0)
 
 
-def test_noise_inside_the_dead_zone_moves_no_eye():
+def test_eyes_jump_to_a_new_target_and_noise_inside_the_dead_zone_moves_none():
     rng = np.random.default_rng(0)
     noise = rng.uniform(-0.4, 0.4, (400, 2))
     shown = looked(lambda t: looking(5.0 + noise[int(t / TICK_S), 0], noise[int(t / TICK_S), 1]), 3.0)
     assert np.ptp(eyes_deg(shown), axis=(0, 1)).max() < 1e-4
-
-
-def test_eyes_jump_to_a_new_target_and_do_not_glide():
     shown = eyes_deg(looked(lambda t: looking(0.0 if t < 0.5 else 12.0), 1.0))[:, 0, 0]
     assert shown[0] == 0 and shown[-1] == pytest.approx(12.0, abs=1e-3)
     between = (shown > 0.1) & (shown < 11.9)
@@ -94,14 +91,11 @@ def test_no_joint_jumps_whatever_its_lead():
     assert speed.max() < 1000  # a 40-degree saccade peaks at about 640 deg/s
 
 
-def test_both_eyes_keep_the_angle_between_them():
+def test_both_eyes_keep_the_angle_between_them_and_lids_follow_the_gaze_that_is_shown():
     row = looking(4.0)
     turn(row, np.radians([[6.0, 0.0], [2.0, 0.0]]), FULL_RAD)
     shown = looked(lambda t: row, 0.5)
     assert np.degrees(directions(shown[-1, 0], FULL_RAD))[:, 0] == pytest.approx([6.0, 2.0], abs=1e-4)
-
-
-def test_lids_follow_the_gaze_that_is_shown():
     head = load_head("face28")
     lid = list(head.joints).index("lid_left")
     shown = looked(lambda t: looking(0.0, pitch=-0.2 if t > 0.5 else 0.0), 1.0)  # nose up: the eyes go down
@@ -131,20 +125,14 @@ def test_there_and_back(mount, place_m, pose):
     assert from_base(mount, camera.to_base(place_m, pose), pose) == pytest.approx(np.array(place_m), abs=1e-9)
 
 
-def test_a_head_that_has_turned_left_sees_who_was_ahead_on_its_right():
+def test_a_camera_sees_a_person_from_a_turned_head_or_from_above_in_the_bases_axes():
     mount = CameraMount(on="head")
     camera = Camera(mount)
     turned = np.array([0, 0, np.radians(30), 0, 0, 0])
     seen = from_base(mount, (2.0, 0.0, 0.0), turned)
     assert np.degrees(direction_to(seen)) == pytest.approx([-30, 0])
     assert np.degrees(direction_to(camera.to_base((2.0, 0.0, 0.0), turned))) == pytest.approx([30, 0])
-
-
-def test_a_camera_that_looks_down_from_above_sees_who_is_ahead_above_its_axis():
     camera = Camera(CameraMount(on="base", at_m=(0, 0, 0.3), rpy_deg=(0, 20, 0)))
     assert camera.to_base((1.0, 0.0, 0.0), np.zeros(6)) == pytest.approx([0.9397, 0, 0.3 - 0.342], abs=1e-3)
-
-
-def test_directions_are_those_of_eyes_and_neck():
     assert np.degrees(direction_to(np.array([1.0, 1.0, 0.0]))) == pytest.approx([45, 0])
     assert np.degrees(direction_to(np.array([1.0, 0.0, -1.0]))) == pytest.approx([0, 45])  # below: nose down

@@ -104,9 +104,10 @@ def test_nobody_left_is_looked_for():
     assert np.ptp(head_deg(shown[400:])[:, 0]) > 10
 
 
-def test_without_a_face_ever_or_a_camera_the_person_is_straight_ahead():
+def test_without_a_face_a_camera_or_the_section_nothing_is_aimed_at():
     for watched, camera in ((lambda t, shown: Watched(), BASE), (at(beside(30)), None)):
         assert not aimed(watched, 5.0, camera=camera).any()
+    assert not aimed(at(beside(30)), 2.0, person=None).any()
 
 
 def test_a_camera_on_the_head_sees_one_person_while_the_neck_turns():
@@ -143,10 +144,6 @@ def test_a_head_without_eyes_turns_all_the_way_and_one_without_a_neck_not_at_all
     assert head_deg(aimed(at(beside(30)), 4.0, gaze=None))[-1, 0, 0] == pytest.approx(30, abs=0.1)
     shown = aimed(at(beside(20)), 4.0, gaze=Gaze(neck_gain=0))
     assert not head_deg(shown).any() and gaze_deg(shown)[-1, 0, 0] == pytest.approx(20, abs=0.1)
-
-
-def test_nothing_is_aimed_at_where_the_section_is_left_out():
-    assert not aimed(at(beside(30)), 2.0, person=None).any()
 
 
 def test_one_seed_is_one_life():

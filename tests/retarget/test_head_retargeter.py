@@ -15,18 +15,13 @@ HEADS = head_names()
 
 
 @pytest.mark.parametrize("name", HEADS)
-def test_a_step_and_a_face_held_for_ever_agree_where_the_neck_remembers_nothing(name):
+def test_a_shipped_head_has_no_problem_rests_with_the_neutral_face_and_shows_or_names_every_channel(name):
     retargeter = HeadRetargeter(load_head(name))
     face = motion(roll=0.05, pitch=0.1, yaw=-0.2, jawOpen=0.5, browInnerUp=0.4)
     stepped, _ = retargeter.step(face, retargeter.start())
     assert np.array_equal(stepped, retargeter.angles(face))
     rows = np.tile(face, (3, len(retargeter.joints), 1))
     assert retargeter.angles(rows) == pytest.approx(np.tile(stepped, (3, 1)), abs=1e-9)
-
-
-@pytest.mark.parametrize("name", HEADS)
-def test_every_channel_is_shown_or_told_as_lost(name):
-    retargeter = HeadRetargeter(load_head(name))
     rest = retargeter.angles(motion())
     for channel in CHANNELS:
         sizes = (0.02, -0.02) if channel in CHANNELS[:6] else (1.0,)
@@ -34,16 +29,17 @@ def test_every_channel_is_shown_or_told_as_lost(name):
         alone = channel in ("eyeWideLeft", "eyeWideRight", "mouthClose")  # those only ever take something back
         assert moved or alone or channel in retargeter.blind_channels, channel
         assert not (moved and channel in retargeter.blind_channels), channel
+    head = load_head(name)
+    rest = np.array([joint.rest_rad for joint in head.joints.values()])
+    assert HeadRetargeter(head).angles(np.zeros(MOTION_DIM, np.float32)) == pytest.approx(rest, rel=0, abs=1e-9)
+    assert check_head(name) == []
 
 
-def test_the_whole_neck_shows_the_pose_of_one_instant():
+def test_the_whole_neck_shows_the_pose_of_one_instant_scaled_by_its_regions_intensity():
     retargeter = HeadRetargeter(load_head("reachy_mini"))
     rows = np.stack([motion(pitch=0.01 * row) for row in range(len(retargeter.joints))])
     one = retargeter.angles(rows[retargeter.neck_columns[0]])
     assert np.array_equal(retargeter.angles(rows)[retargeter.neck_columns], one[retargeter.neck_columns])
-
-
-def test_intensity_of_the_necks_region_scales_the_pose():
     retargeter = HeadRetargeter(load_head("face28"))
     yaw = retargeter.joints.index("neck_yaw")
     for intensity in (0.0, 0.5, 2.0):
@@ -83,7 +79,6 @@ def test_a_rest_that_is_not_the_necks_home_is_told():
 
 
 # --- laws of every shipped head ---
-
 FRAMES = 10_000
 
 
@@ -107,15 +102,3 @@ def test_angles_are_finite_and_inside_the_range_for_ten_thousand_wild_frames(nam
     angles = np.concatenate([retargeter.angles(part, knobs) for part in np.array_split(rows, 10)])
     low, high = np.array([(joint.min_rad, joint.max_rad) for joint in head.joints.values()]).T
     assert np.isfinite(angles).all() and (angles >= low).all() and (angles <= high).all()
-
-
-@pytest.mark.parametrize("name", HEADS)
-def test_the_neutral_face_is_the_rest_pose(name):
-    head = load_head(name)
-    rest = np.array([joint.rest_rad for joint in head.joints.values()])
-    assert HeadRetargeter(head).angles(np.zeros(MOTION_DIM, np.float32)) == pytest.approx(rest, rel=0, abs=1e-9)
-
-
-@pytest.mark.parametrize("name", HEADS)
-def test_a_shipped_head_has_no_problem(name):
-    assert check_head(name) == []

@@ -33,20 +33,14 @@ def blinks(shown) -> int:
     return int((np.diff(closed.astype(int)) == 1).sum())
 
 
-def test_with_everything_left_out_the_face_is_untouched():
+def test_with_everything_left_out_or_at_zero_the_face_is_the_same_and_the_input_never_changes():
     alive = spontaneous.HeadLife(Life(), seed=0)
     motion = np.random.default_rng(0).uniform(0, 1, (3, MOTION_DIM)).astype(np.float32)
     assert alive.step(motion, LEADS_S, 0.0, spontaneous.LifeState())[0] is motion
-
-
-def test_with_every_kind_at_zero_the_face_is_the_same():
     motion = np.random.default_rng(0).uniform(0, 1, MOTION_DIM).astype(np.float32)
     shown = idled(lambda t: motion, 10.0, blinks_per_minute=0, head_deg=0, glance_deg=0)
     others = [i for i in range(MOTION_DIM) if not 16 <= i < 24]  # eye channels that pull both ways are evened out
     assert np.array_equal(shown[..., others], np.broadcast_to(motion[others], shown[..., others].shape))
-
-
-def test_the_input_is_not_changed():
     motion = still(0)[None].repeat(3, axis=0)
     alive = spontaneous.HeadLife(Life(idle=Idle()), seed=0)
     state = spontaneous.LifeState()
@@ -63,12 +57,10 @@ def test_a_listener_that_blinks_enough_gets_no_blink_added(every_s):
     assert np.array_equal(shown[..., BLINK], wanted[..., BLINK])
 
 
-def test_a_listener_that_never_blinks_gets_the_wanted_rate():
+def test_a_listener_that_never_blinks_gets_the_wanted_rate_until_it_begins_to_blink():
     per_minute = np.mean([blinks(idled(still, 210.0, seed)[1500:]) / 3.0 for seed in range(2)])
     assert 10 < per_minute < 18
 
-
-def test_own_blinks_fade_out_when_the_listener_begins_to_blink():
     def late(t: float) -> np.ndarray:
         return blinking(3.0)(t) if t > 60 else still(t)
 

@@ -26,11 +26,12 @@ def test_rotations_and_angles_are_those_of_scipy(roll, pitch, yaw):
     assert np.abs((away + np.pi) % (2 * np.pi) - np.pi).max() < 1e-9
 
 
-def test_plus_is_right_ear_down_nose_down_and_turn_to_the_left():
+def test_plus_is_right_ear_down_nose_down_and_left_and_small_angles_are_exact():
     forward, left = np.eye(3)[0], np.eye(3)[1]
     assert (rotations.rotation(np.array([0.3, 0, 0])) @ left)[2] > 0  # the left ear goes up
     assert (rotations.rotation(np.array([0, 0.3, 0])) @ forward)[2] < 0
     assert (rotations.rotation(np.array([0, 0, 0.3])) @ forward)[1] > 0
+    assert rotations.angle_between(np.eye(3), rotations.about(1, 1e-9)) == pytest.approx(1e-9, rel=1e-6)
 
 
 @pytest.mark.parametrize("axes", list(permutations(range(3))))
@@ -62,10 +63,6 @@ def test_no_other_turn_about_the_axis_leaves_less_than_the_twist(seed, axis, off
     best = rotations.twist(matrix, axis)
     left = rotations.angle_between(matrix, rotations.about(axis, best))
     assert (left <= rotations.angle_between(matrix, rotations.about(axis, best + off)) + 1e-12).all()
-
-
-def test_small_angles_between_rotations_are_exact():
-    assert rotations.angle_between(np.eye(3), rotations.about(1, 1e-9)) == pytest.approx(1e-9, rel=1e-6)
 
 
 @given(seeds, turns)

@@ -47,13 +47,9 @@ def test_the_inverse_is_that_of_the_published_geometry(row):
 
 
 @given(seeds)
-def test_forward_of_inverse_is_the_pose_all_over_the_reach_starting_at_home(seed):
+def test_forward_of_inverse_is_the_pose_and_every_rod_keeps_its_length(seed):
     wanted = in_reach(seed, 100)
     assert np.abs(PLATFORM.forward(PLATFORM.inverse(wanted), HOME) - wanted).max() < 1e-9
-
-
-@given(seeds)
-def test_every_rod_keeps_its_length(seed):
     wanted = in_reach(seed)
     for leg, angles in zip(CONFIG.legs, PLATFORM.inverse(wanted).T, strict=True):
         servo = np.array(leg.servo_from_body)
@@ -66,14 +62,10 @@ def test_every_rod_keeps_its_length(seed):
 
 
 @given(seeds)
-def test_a_mirrored_pose_gives_the_cranks_of_the_other_side_turned_the_other_way(seed):
+def test_a_mirrored_pose_gives_mirrored_cranks_and_a_small_move_of_the_head_a_small_one_of_them(seed):
     wanted = 0.9 * in_reach(seed)
     mirrored = wanted * np.array([-1, 1, -1, 1, -1, 1])
     assert PLATFORM.inverse(mirrored) == pytest.approx(-PLATFORM.inverse(wanted)[:, ::-1], abs=5e-4)  # as it was drawn
-
-
-@given(seeds)
-def test_a_small_move_of_the_head_is_a_small_move_of_the_cranks(seed):
     wanted = in_reach(seed)
     step = np.random.default_rng(seed).normal(size=wanted.shape) * 1e-6 / WEIGHTS
     moved = np.linalg.norm(PLATFORM.inverse(wanted + step) - PLATFORM.inverse(wanted), axis=1)
@@ -109,7 +101,6 @@ def test_a_home_outside_the_cranks_ranges_is_told_with_the_angles():
 
 
 # --- the nearest pose within reach, and the body that turns along ---
-
 FAR = np.array([0.6, 0.6, 1.5, 0.05, 0.05, 0.05])
 LONGEST_STEP = 8.0  # times the step that was asked; a border met at a slant is passed faster than the target moves
 
@@ -180,8 +171,7 @@ def test_such_a_path_does_cross_the_border():
 
 
 @pytest.mark.parametrize(
-    ("axis", "low", "high"),
-    [("x", -0.0465, 0.0505), ("y", -0.0475, 0.0475), ("z", -0.0505, 0.023)],
+    ("axis", "low", "high"), [("x", -0.0465, 0.0505), ("y", -0.0475, 0.0475), ("z", -0.0505, 0.023)]
 )
 def test_along_one_axis_the_platform_reaches_as_far_as_its_cranks_let_it(axis, low, high):
     for sign, end in ((-1, low), (1, high)):
@@ -199,20 +189,21 @@ def test_the_stated_lean_limits_hold_though_the_cranks_could_go_further(column, 
     assert solved.residual_rad == pytest.approx([0.0, np.radians(5)], abs=1e-6)
 
 
-def test_the_body_turns_only_for_what_the_platform_should_not():
+def test_the_body_turns_for_what_the_platform_should_not_or_as_it_is_given():
     wanted = np.zeros((5, 6))
     wanted[:, 2] = np.radians([0, 39, -41, 90, 179])
     solved = NECK.solve(wanted)
     assert np.degrees(solved.angles_rad[:, 0]) == pytest.approx([0, 0, -1, 50, 139]) and solved.reached.all()
     assert NECK.forward(solved.angles_rad, wanted) == pytest.approx(wanted, abs=1e-9)
-
-
-def test_a_body_yaw_that_is_given_is_kept_and_the_platform_makes_up_for_it():
     wanted = np.array([0.1, 0.1, 0.2, 0, 0, 0])
     solved = NECK.solve(wanted, np.array(-0.3))
     assert solved.angles_rad[0] == -0.3 and solved.reached
     assert NECK.forward(solved.angles_rad, wanted) == pytest.approx(wanted, abs=1e-9)
     assert NECK.solve(wanted, np.array(9.0)).angles_rad[0] == HIGH[0]
+    fixed = build_neck(CONFIG.model_copy(update={"body_yaw": None}), HEAD.joints)
+    assert fixed.joints == tuple(f"stewart_{leg}" for leg in range(1, 7)) and not fixed.turns_body
+    with pytest.raises(ValueError, match="no body yaw"):
+        fixed.solve(np.zeros(6), np.zeros(()))
 
 
 def test_with_a_low_pass_the_body_follows_slowly_and_at_once_past_the_platforms_part():
@@ -226,10 +217,3 @@ def test_with_a_low_pass_the_body_follows_slowly_and_at_once_past_the_platforms_
     assert body_deg[0] == pytest.approx(20) and body_deg[-1] == pytest.approx(60, abs=0.1)
     assert (np.diff(body_deg) >= -1e-9).all()
     assert slow.solve(wanted).angles_rad[0] == pytest.approx(np.radians(60))
-
-
-def test_without_a_turning_body_the_legs_are_all_joints_and_a_body_yaw_is_refused():
-    fixed = build_neck(CONFIG.model_copy(update={"body_yaw": None}), HEAD.joints)
-    assert fixed.joints == tuple(f"stewart_{leg}" for leg in range(1, 7)) and not fixed.turns_body
-    with pytest.raises(ValueError, match="no body yaw"):
-        fixed.solve(np.zeros(6), np.zeros(()))

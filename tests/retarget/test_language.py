@@ -37,16 +37,13 @@ def shown(head, knobs=None, **channels):
     return (np.degrees(mapping.angles(motion(**channels), knobs)) / 10).tolist()
 
 
-def test_a_shared_expression_is_what_it_says_wherever_it_is_used():
+def test_expressions_are_what_they_say_wherever_they_are_used_also_in_one_another():
     smile = {"mean": ["mouthSmileLeft", "mouthSmileRight"]}
     head = head_of(
         {"corner": {"drive": "smile"}, "cheek": {"drive": {"sum": [{"use": "smile", "gain": 0.5}, "cheekPuff"]}}},
         expressions={"smile": smile},
     )
     assert shown(head, mouthSmileLeft=1.0, mouthSmileRight=0.6, cheekPuff=0.2) == pytest.approx([0.8, 0.6])
-
-
-def test_expressions_may_use_each_other():
     head = head_of({"jaw": {"drive": "third"}}, expressions={
         "third": {"use": "second", "offset": 0.1}, "first": "jawOpen", "second": {"use": "first", "gain": 0.5},
     })  # fmt: skip
@@ -90,14 +87,11 @@ LIPS = {
 APART = [{"keep": {"upper": 1, "lower": 1, "jaw": 0.5}, "at_least": -0.2, "moving": ["lower", "upper"]}]
 
 
-def test_the_lower_lip_gives_way_to_the_upper_and_the_open_jaw_makes_room():
+def test_joints_give_way_to_one_another_in_turn_and_the_open_jaw_makes_room():
     head = head_of(LIPS, couplings=APART)
     assert shown(head, mouthRollUpper=0.5, mouthRollLower=0.5) == pytest.approx([-0.5, 0.3, 0])
     assert shown(head, mouthRollUpper=0.5, mouthRollLower=0.5, jawOpen=0.8) == pytest.approx([-0.5, -0.1, 0.8])
     assert shown(head, mouthRollUpper=0.1, mouthRollLower=0.1) == pytest.approx([-0.1, -0.1, 0])
-
-
-def test_who_gives_way_next_does_where_the_first_has_no_range_left():
     first = {"keep": {"upper": 1, "lower": 0.5}, "at_least": 0, "moving": ["lower", "upper"]}
     assert shown(head_of(LIPS, couplings=[first]), mouthRollUpper=1.0) == pytest.approx([-0.5, 1, 0])
 
@@ -133,16 +127,13 @@ def test_style_doubles_or_removes_what_is_small_and_leaves_the_ends(style, wante
     assert np.all(np.diff(swept) >= 0)
 
 
-def test_wrong_knobs_are_told_with_the_choices():
+def test_wrong_knobs_are_told_with_the_choices_and_channels_and_joints_left_out_are_listed():
     mapping = ChannelMapping(head_of({"jaw": {"drive": "jawOpen"}}, regions={"mouth": {"joints": ["jaw"]}}))
     with pytest.raises(ConfigError, match=r"intensity: 'nose' is not a region of this head \(mouth\)"):
         mapping.knobs({"nose": 1})
     for value in (2.5, -0.1, float("nan")):
         with pytest.raises(ConfigError, match=r"style of mouth = .* is not in 0..2"):
             mapping.knobs(style={"mouth": value})
-
-
-def test_channels_and_joints_that_are_left_out_are_listed():
     mapping = ChannelMapping(
         head_of({"jaw": {"drive": "open"}, "ear": {}}, expressions={"open": {"max": ["jawOpen", "yaw"]}})
     )
@@ -160,8 +151,6 @@ def test_products_of_absurd_channels_stay_finite(seed):
 
 
 # --- any expression, beside its meaning ---
-
-
 def driven(*drives, **joint) -> Head:
     """A head with a joint for each expression, None: one that nothing drives."""
     ends = {"min_deg": -10.0, "rest_deg": 2.0, "max_deg": 30.0}

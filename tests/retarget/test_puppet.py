@@ -36,12 +36,9 @@ def play(puppet, ticks, face, asked=(), leads_s=LEADS_S):
     return np.array(out)
 
 
-def test_a_face_that_nobody_works_is_the_listeners_own():
+def test_a_face_that_nobody_works_is_the_listeners_own_and_the_input_is_never_changed():
     motion = np.random.default_rng(1).normal(size=(5, MOTION_DIM)).astype(np.float32)
     assert Puppet().overlay(motion, np.arange(5) / 25) is motion
-
-
-def test_the_input_is_never_changed():
     puppet, motion = Puppet(), np.tile(base_face(), (4, 1))
     puppet.show({"jawOpen": 1.0}, 1.0)
     kept = motion.copy()
@@ -60,12 +57,18 @@ def test_a_whole_face_is_reached_held_and_left_again():
     assert np.array_equal(rows[-1], face)
 
 
-def test_channels_that_are_not_named_stay_the_listeners():
+def test_channels_that_are_not_named_stay_the_listeners_and_a_stream_of_faces_takes_no_room():
     face = base_face()
     rows = play(Puppet(), 100, face, {5: lambda p: p.show({"jawOpen": 1.0}, 0.2)}, np.zeros(1))[:, 0]
     others = np.delete(np.arange(MOTION_DIM), JAW)
     assert np.array_equal(rows[:, others], np.tile(face[others], (100, 1)))
     assert rows[:, JAW].max() == pytest.approx(1.0)
+    puppet, still = Puppet(), np.zeros(MOTION_DIM, np.float32)
+    wanted = [0.5 + 0.4 * math.sin(tick / 15) for tick in range(400)]
+    asked = {tick: lambda p, v=wanted[tick]: p.show({"jawOpen": v}, 0.3) for tick in range(0, 400, 4)}
+    jaw = play(puppet, 400, still, asked, np.zeros(1))[:, 0, JAW]
+    assert np.abs(jaw[60:] - np.array(wanted)[50:-10]).max() < 0.1  # a tenth of a second behind
+    assert len(puppet._pieces) <= 5
 
 
 asked_at = st.lists(
@@ -133,15 +136,6 @@ def test_a_head_without_eyes_turns_all_the_way_and_one_without_a_neck_its_eyes()
     assert eyeless[YAW] == pytest.approx(math.atan2(0.2, 1.0), abs=1e-4)
     assert stiff[YAW] == 0.0
     assert directions(stiff, FULL_RAD).mean(axis=0)[0] == pytest.approx(math.atan2(0.2, 1.0), abs=1e-4)
-
-
-def test_a_stream_of_faces_flows_and_takes_no_room():
-    puppet, still = Puppet(), np.zeros(MOTION_DIM, np.float32)
-    wanted = [0.5 + 0.4 * math.sin(tick / 15) for tick in range(400)]
-    asked = {tick: lambda p, v=wanted[tick]: p.show({"jawOpen": v}, 0.3) for tick in range(0, 400, 4)}
-    jaw = play(puppet, 400, still, asked, np.zeros(1))[:, 0, JAW]
-    assert np.abs(jaw[60:] - np.array(wanted)[50:-10]).max() < 0.1  # a tenth of a second behind
-    assert len(puppet._pieces) <= 5
 
 
 REFUSED = [

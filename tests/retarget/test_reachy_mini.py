@@ -20,18 +20,12 @@ def raised_deg(**channels: float) -> tuple[float, float]:
     return float(right), -float(left)
 
 
-def test_brows_raise_and_lower_both_antennas_by_parts_of_forty_degrees():
+def test_antennas_show_brows_and_smiles_by_parts_of_forty_degrees_on_their_side():
     assert raised_deg(browInnerUp=1.0) == pytest.approx((32, 32), abs=1e-4)
     assert raised_deg(browDownLeft=1.0, browDownRight=1.0) == pytest.approx((-24, -24), abs=1e-4)
     assert raised_deg(mouthSmileLeft=1.0, mouthSmileRight=1.0) == pytest.approx((12, 12), abs=1e-4)
     assert raised_deg(mouthFrownLeft=1.0, mouthFrownRight=1.0) == pytest.approx((-12, -12), abs=1e-4)
-
-
-def test_a_brow_raised_on_one_side_raises_that_sides_antenna_more():
     assert raised_deg(browOuterUpLeft=1.0) == pytest.approx((4, 20), abs=1e-4)
     assert raised_deg(browOuterUpRight=1.0) == pytest.approx((20, 4), abs=1e-4)
-
-
-def test_everything_up_at_once_ends_at_the_end_of_the_range():
     up = {name: 1.0 for name in ("browInnerUp", "browOuterUpLeft", "browOuterUpRight", "mouthSmileLeft")}
     assert raised_deg(**up) == pytest.approx((40, 40))

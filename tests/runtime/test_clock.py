@@ -7,12 +7,9 @@ import pytest
 from sfms_robot.runtime.clock import TickPace, VirtualClock, tick_times
 
 
-def test_ticks_are_exact_multiples_of_the_period() -> None:
+def test_ticks_are_exact_multiples_of_the_period_whatever_work_is_shorter_than_one() -> None:
     times = [beat.time_s for beat in itertools.islice(tick_times(VirtualClock(), 100, 0.0), 1000)]
     assert times == [pytest.approx(i / 100, abs=1e-12) for i in range(1000)]
-
-
-def test_work_shorter_than_a_period_does_not_shift_the_next_tick() -> None:
     clock = VirtualClock()
     ticks = tick_times(clock, 50, 0.0)
     next(ticks)
@@ -32,14 +29,11 @@ def test_a_late_tick_is_reported_and_missed_ticks_are_skipped_not_chased() -> No
     assert next(ticks).time_s == pytest.approx(0.080)
 
 
-def test_virtual_time_never_runs_backwards() -> None:
+def test_virtual_time_never_runs_backwards_and_ticks_go_on_from_where_it_is() -> None:
     clock = VirtualClock()
     clock.wait_until(2.0)
     clock.wait_until(1.0)
     assert clock.now_s() == 2.0
-
-
-def test_ticks_go_on_from_where_the_clock_is() -> None:
     clock = VirtualClock()
     clock.wait_until(5.013)
     assert next(tick_times(clock, 100, 5.0)).time_s == pytest.approx(0.02)

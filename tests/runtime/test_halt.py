@@ -74,8 +74,6 @@ class Chip:
 
 
 # --- one row of docs/safety.md each, and all pairs of them ------------------------------------------------------------
-
-
 @dataclass
 class Cause:
     """A row: how it begins, how it stops being active (None: it never is), where it is cleared."""
@@ -159,8 +157,6 @@ def test_each_door_clears_its_own_causes_and_the_device_all_but_none_while_one_i
 
 
 # --- the latch ----------------------------------------------------------------------------------------------------
-
-
 def test_a_cause_that_comes_again_while_a_resume_reads_the_switches_stays() -> None:
     latch = HaltLatch()
     latch.close("key")
@@ -282,8 +278,6 @@ def test_a_handler_does_not_wait_for_the_latch_that_it_interrupts() -> None:
 
 
 # --- switches -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("where", "says"),
     [

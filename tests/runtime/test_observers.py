@@ -23,10 +23,13 @@ def tick(state: str = "listening", why: tuple[str, ...] = ()) -> Tick:
     return Tick(2.0, np.zeros(58, np.float32), np.array([0.5, -0.5]), readings, state, why)
 
 
-def test_before_the_first_tick_it_is_starting() -> None:
+def test_before_the_first_tick_it_is_starting_and_counters_are_asked_for_every_time() -> None:
     document = RunStatus(JOINTS, {"head": "face28"}).document()
     assert (document["head"], document["state"], document["person"]["seen"]) == ("face28", "starting", False)
     json.dumps(document, allow_nan=False)
+    counts = iter(range(9))
+    status = RunStatus(JOINTS, {}, lambda: {"ticks": next(counts)})
+    assert [status.document()["ticks"] for _ in range(3)] == [0, 1, 2]
 
 
 def test_joints_are_told_by_name_with_null_for_what_nobody_knows() -> None:
@@ -68,12 +71,6 @@ def test_it_says_why_something_is_not_followed(state: str, why: tuple[str, ...],
     status.tick(tick(state, why))
     note = status.document()["note"]
     assert note is None if says is None else says in note
-
-
-def test_counters_are_asked_for_every_time() -> None:
-    counts = iter(range(9))
-    status = RunStatus(JOINTS, {}, lambda: {"ticks": next(counts)})
-    assert [status.document()["ticks"] for _ in range(3)] == [0, 1, 2]
 
 
 @pytest.mark.parametrize("error", [None, "torque of jaw could not be confirmed off"])
@@ -124,22 +121,14 @@ def test_a_run_is_ready_when_it_listens_alive_while_it_ticks_and_says_what_it_is
     assert said(receiver) == ["STOPPING=1", "WATCHDOG=1"]
 
 
-def test_who_does_not_tick_says_nothing(systemd):
+def test_nothing_is_said_before_a_tick_without_a_watchdog_or_for_that_of_another_process(systemd):
     receiver, name = systemd
     NotifyingObserver(ServiceManager({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "2000000"}))
     assert said(receiver) == []
-
-
-def test_without_a_watchdog_nothing_is_said_of_being_alive(systemd):
-    receiver, name = systemd
     manager = ServiceManager({"NOTIFY_SOCKET": name})
     manager.alive()
     manager.ready("up")
     assert said(receiver) == ["READY=1\nSTATUS=up"]
-
-
-def test_the_watchdog_of_another_process_is_not_ours(systemd):
-    receiver, name = systemd
     ServiceManager({"NOTIFY_SOCKET": name, "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}).alive()
     assert said(receiver) == []
 

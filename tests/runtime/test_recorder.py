@@ -165,21 +165,12 @@ def test_a_full_disk_is_named_with_its_flag_before_anything_moves_and_later_in_t
         Recorder(tmp_path, JOINTS)
 
 
-def test_a_folder_that_cannot_be_looked_into_is_named_with_its_flag(tmp_path):
+def test_a_folder_that_cannot_be_used_is_named_with_its_flag(tmp_path):
     with pytest.raises(ConfigError, match="^--record .*xxx: File name too long$"):
         check_folder(tmp_path / ("x" * 300))
-
-
-def test_a_folder_that_cannot_be_made_is_a_configuration_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="--record .*file/run: Not a directory"):
         Recorder(tmp_path / "file" / "run", JOINTS)
-
-
-def test_a_report_that_cannot_be_written_is_said_and_loses_nothing(tmp_path, caplog):
-    (tmp_path / "file").write_text("")
-    write_report(tmp_path / "file", {})
-    assert "the report cannot be written" in caplog.text
 
 
 def test_a_report_that_cannot_be_written_leaves_no_part_of_it(tmp_path):
@@ -196,10 +187,13 @@ def test_a_recording_is_not_overwritten_unasked(tmp_path):
     check_folder(tmp_path, overwrite=True)
 
 
-def test_the_report_is_json(tmp_path):
+def test_the_report_is_json_and_one_that_cannot_be_written_is_said(tmp_path, caplog):
     write_report(tmp_path / "new", {"version": 1})
     assert json.loads((tmp_path / "new" / "report.json").read_text()) == {"version": 1}
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["report.json"]
+    (tmp_path / "file").write_text("")
+    write_report(tmp_path / "file", {})
+    assert "the report cannot be written" in caplog.text
 
 
 def test_a_long_recording_goes_on_in_files_that_are_each_whole(tmp_path, monkeypatch):

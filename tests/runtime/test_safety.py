@@ -8,17 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import Reading
-from sfms_robot.runtime.safety import (
-    COOLER_C,
-    PER_S,
-    WARM_SHARE,
-    Heat,
-    HeatGuard,
-    Interrupt,
-    Released,
-    signals_to,
-    temperatures_C,
-)
+from sfms_robot.runtime import safety
 
 
 class NoBus:
@@ -35,13 +25,13 @@ def test_a_first_signal_is_a_request_a_second_releases_and_a_third_only_says_so_
     ours, bus = signal.default_int_handler, NoBus()
     before = signal.signal(number, ours)  # whatever the tests were started under
     try:
-        interrupt = Interrupt()
+        interrupt = safety.Interrupt()
         interrupt.arm(bus)
-        with signals_to(interrupt):
+        with safety.signals_to(interrupt):
             assert not interrupt()
             signal.raise_signal(number)
             assert interrupt() and bus.released == 0
-            with pytest.raises(Released):
+            with pytest.raises(safety.Released):
                 signal.raise_signal(number)
             assert bus.released == 1
             signal.raise_signal(number)  # it must not cut short what the second has begun
@@ -52,9 +42,9 @@ def test_a_first_signal_is_a_request_a_second_releases_and_a_third_only_says_so_
 
 
 def test_ctrl_backslash_releases_at_once() -> None:
-    bus, interrupt = NoBus(), Interrupt()
+    bus, interrupt = NoBus(), safety.Interrupt()
     interrupt.arm(bus)
-    with signals_to(interrupt), pytest.raises(Released):
+    with safety.signals_to(interrupt), pytest.raises(safety.Released):
         signal.raise_signal(signal.SIGQUIT)
     assert bus.released == 1
 
@@ -62,8 +52,8 @@ def test_ctrl_backslash_releases_at_once() -> None:
 def test_a_signal_that_is_ignored_stays_so() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        interrupt = Interrupt()
-        with signals_to(interrupt):
+        interrupt = safety.Interrupt()
+        with safety.signals_to(interrupt):
             signal.raise_signal(signal.SIGHUP)
             assert not interrupt()
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
@@ -75,10 +65,10 @@ WARM, HOT = np.full(3, 60.0), np.full(3, 67.0)
 
 
 def test_shares_follow_the_temperature_and_come_back_a_little_below() -> None:
-    guard, heat = HeatGuard(WARM, HOT), Heat.cool(3)
+    guard, heat, warm, cooler_c = safety.HeatGuard(WARM, HOT), safety.Heat.cool(3), safety.WARM_SHARE, safety.COOLER_C
     for degrees, wanted in [
-        (59.9, 1.0), (60.0, WARM_SHARE), (67.0, 0.0), (67.0 - COOLER_C + 0.1, 0.0), (67.0 - COOLER_C - 0.1, WARM_SHARE),
-        (60.0 - COOLER_C + 0.1, WARM_SHARE), (60.0 - COOLER_C - 0.1, 1.0),
+        (59.9, 1.0), (60.0, warm), (67.0, 0.0), (67.0 - cooler_c + 0.1, 0.0), (67.0 - cooler_c - 0.1, warm),
+        (60.0 - cooler_c + 0.1, warm), (60.0 - cooler_c - 0.1, 1.0),
     ]:  # fmt: skip
         heat = guard.judge(np.array([degrees, 20.0, np.nan]), heat)
         assert heat.wanted.tolist() == [wanted, 1.0, 1.0], degrees
@@ -86,19 +76,19 @@ def test_shares_follow_the_temperature_and_come_back_a_little_below() -> None:
 
 @given(st.lists(st.lists(st.floats(0, 100), min_size=3, max_size=3), min_size=1, max_size=50))
 def test_a_share_never_jumps_and_the_neck_goes_as_one(degrees: list[list[float]]) -> None:
-    guard, heat, dt_s = HeatGuard(WARM, HOT, (0, 2)), Heat.cool(3), 0.01
+    guard, heat, dt_s = safety.HeatGuard(WARM, HOT, (0, 2)), safety.Heat.cool(3), 0.01
     for row in degrees:
         after = guard.after(guard.judge(np.array(row), heat), dt_s)
-        assert np.abs(after.share - heat.share).max() <= PER_S * dt_s + 1e-12
+        assert np.abs(after.share - heat.share).max() <= safety.PER_S * dt_s + 1e-12
         assert after.share[0] == after.share[2]
         assert ((after.share >= 0) & (after.share <= 1)).all()
         heat = after
 
 
 def test_a_hot_joint_is_at_rest_after_two_seconds_and_comes_back_when_it_has_cooled() -> None:
-    guard, heat = HeatGuard(WARM, HOT), Heat.cool(3)
+    guard, heat = safety.HeatGuard(WARM, HOT), safety.Heat.cool(3)
     for degrees, shown in ((70.0, 0.0), (30.0, 1.0)):
-        for _ in range(round(1 / PER_S / 0.01) + 1):
+        for _ in range(round(1 / safety.PER_S / 0.01) + 1):
             heat = guard.after(guard.judge(np.array([degrees, 20.0, 20.0]), heat), 0.01)
         assert np.allclose(heat.share, [shown, 1.0, 1.0])
     assert heat.none
@@ -106,5 +96,5 @@ def test_a_hot_joint_is_at_rest_after_two_seconds_and_comes_back_when_it_has_coo
 
 def test_temperatures_are_read_where_they_are_told() -> None:
     readings = {"a": Reading(0.0, 0.0, extra={"temperature_C": 41.0}), "b": Reading(0.0, 0.0)}
-    assert temperatures_C(["a", "b", "c"], readings)[0] == 41.0
-    assert np.isnan(temperatures_C(["a", "b", "c"], readings)[1:]).all()
+    assert safety.temperatures_C(["a", "b", "c"], readings)[0] == 41.0
+    assert np.isnan(safety.temperatures_C(["a", "b", "c"], readings)[1:]).all()

@@ -36,14 +36,11 @@ def test_goal_that_is_no_goal_is_named(bad):
         goals_of(2).ticks(np.array([0.0, bad]), BOTH)
 
 
-def test_a_joint_that_is_not_sent_is_not_judged_and_its_way_in_stays_open():
+def test_a_joint_that_is_not_sent_is_not_judged_keeps_its_way_in_and_is_asked_for_nothing_that_is_not_finite():
     goals = goals_of(2)
     goals.hold(1, 2.0)
     goals.ticks(np.array([0.0, 0.0]), FIRST)  # the face goes on while joint1 is away
     goals.ticks(np.array([0.0, 9.0]), FIRST)
     assert goals.ticks(np.array([0.0, 2.0]), BOTH)[1] == round(2048 + 2.0 / RAD)
-
-
-def test_whoever_is_away_is_still_asked_for_nothing_that_is_not_finite():
     with pytest.raises(ValueError, match="goal of joint1 is not finite"):
         goals_of(2).ticks(np.array([0.0, np.nan]), NOBODY)

@@ -35,12 +35,9 @@ def test_two_buses_answer_as_one_in_the_order_of_the_head():
     bus.close()
 
 
-def test_joints_must_be_those_of_the_buses():
+def test_joints_must_be_those_of_the_buses_and_a_bus_that_fails_to_connect_closes_the_others():
     with pytest.raises(ValueError, match="the head has"):
         CompositeBus({"one": plugged([EmulatedServo(1)]).bus}, ["joint1", "joint2"])
-
-
-def test_bus_that_fails_to_connect_closes_the_others():
     good, bad = plugged([EmulatedServo(1)]), plugged([EmulatedServo(2)], ids=[9])
     bus = CompositeBus({"good": good.bus, "bad": bad.bus}, ["joint1", "joint9"])
     with pytest.raises(BusError, match="no answer from id 9"):

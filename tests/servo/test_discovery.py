@@ -8,20 +8,7 @@ from pathlib import Path
 import pytest
 
 from sfms_robot.errors import ConfigError, PortError
-from sfms_robot.servo.discovery import (
-    Holder,
-    SerialDevice,
-    access_problem,
-    check_device,
-    choose_ports,
-    describe,
-    holders,
-    list_ports,
-    parse_ports,
-    ports_data,
-    rivals,
-    stable_name,
-)
+from sfms_robot.servo import discovery
 
 
 @dataclass
@@ -81,7 +68,7 @@ def test_an_adapter_is_described_by_numbers_driver_and_latency_also_through_a_li
         Listed(str(ftdi / "dev" / "ttyS0")),
     )
     places = ftdi, more
-    found = {os.path.basename(each.path): each for each in list_ports(*places)}
+    found = {os.path.basename(each.path): each for each in discovery.list_ports(*places)}
     assert sorted(found) == ["COM3", "cu.usbserial-FT9", "ttyACM0", "ttyAMA0", "ttyS4", "ttyUSB0"]
     usb, acm, com = found["ttyUSB0"], found["ttyACM0"], found["COM3"]
     assert usb.by_id == str(ftdi / "dev" / "serial" / "by-id" / "usb-FTDI_U2D2_FT123-if00-port0")
@@ -90,7 +77,7 @@ def test_an_adapter_is_described_by_numbers_driver_and_latency_also_through_a_li
     assert (acm.vendor, acm.latency_ms, acm.by_id) == (None, None, None)
     assert (com.vendor, com.serial, com.description) == ("0403", "FT9", "USB Serial Port (COM3)")
     assert found["cu.usbserial-FT9"].description is None
-    assert describe(usb.by_id, *places) == usb
+    assert discovery.describe(usb.by_id, *places) == usb
 
 
 def test_holders_are_found_through_links_and_named(ftdi):
@@ -100,14 +87,14 @@ def test_holders_are_found_through_links_and_named(ftdi):
     process(proc, os.getpid(), "ourselves", port)
     (proc / "300").mkdir()  # its files may not be looked at
     link = str(ftdi / "dev" / "serial" / "by-id" / "usb-FTDI_U2D2_FT123-if00-port0")
-    assert holders(link, ftdi) == [Holder(100, "python wizard.py")]
+    assert discovery.holders(link, ftdi) == [discovery.Holder(100, "python wizard.py")]
 
 
 def test_a_port_that_this_process_holds_is_really_seen_in_proc():
     master, slave = os.openpty()
     try:
-        assert holders(os.ttyname(slave)) == []  # held by ourselves only
-        assert access_problem(os.ttyname(slave)) is None
+        assert discovery.holders(os.ttyname(slave)) == []  # held by ourselves only
+        assert discovery.access_problem(os.ttyname(slave)) is None
     finally:
         os.close(master)
         os.close(slave)
@@ -115,16 +102,16 @@ def test_a_port_that_this_process_holds_is_really_seen_in_proc():
 
 def test_what_is_no_serial_port_is_told_apart(tmp_path):
     (tmp_path / "file").touch()
-    assert "directory" in access_problem(str(tmp_path))
-    assert "file" in access_problem(str(tmp_path / "file"))
-    assert "no such device" in access_problem(str(tmp_path / "nothing"))
+    assert "directory" in discovery.access_problem(str(tmp_path))
+    assert "file" in discovery.access_problem(str(tmp_path / "file"))
+    assert "no such device" in discovery.access_problem(str(tmp_path / "nothing"))
     for device, meant in (
         ("192.168.1.5:4000", "is written socket://192.168.1.5:4000"),
         ("null", "is written /dev/null"),
         ("COM12", "are Windows'"),
     ):
         with pytest.raises(PortError, match=rf"^{device}: no such device; .*{meant} \(serial ports here: .+\)$"):
-            check_device(device)
+            discovery.check_device(device)
 
 
 def test_what_else_takes_a_port_is_named_with_the_command_that_frees_it(tmp_path):
@@ -139,7 +126,7 @@ def test_what_else_takes_a_port_is_named_with_the_command_that_frees_it(tmp_path
         (proc / str(pid)).mkdir(parents=True)
         (proc / str(pid) / "comm").write_text(f"{name}\n")
         (proc / str(pid) / "cmdline").write_bytes(line.replace(" ", "\0").encode())
-    told = {path: rivals(path, tmp_path) for path in ("/dev/ttyAMA0", "/dev/ttyUSB3", "/dev/ttyS1")}
+    told = {path: discovery.rivals(path, tmp_path) for path in ("/dev/ttyAMA0", "/dev/ttyUSB3", "/dev/ttyS1")}
     (console, _), (getty, disable) = told["/dev/ttyAMA0"]
     assert "login console" in console and "process 7" in getty
     assert disable == "sudo systemctl disable --now serial-getty@ttyAMA0"
@@ -163,7 +150,7 @@ def plug(root: Path, tty: str, socket: str, serial: str | None, by_id: str) -> L
 
 def names(root: Path, ports: list[Listed], *devices: str) -> list[str]:
     devices = devices or tuple(port.device for port in ports)
-    return [os.path.basename(stable_name(device, root, lambda: ports)) for device in devices]
+    return [os.path.basename(discovery.stable_name(device, root, lambda: ports)) for device in devices]
 
 
 @pytest.mark.parametrize("serial", [None, "0001"])
@@ -187,12 +174,15 @@ def test_without_a_lasting_name_the_device_stays(tmp_path):
 
 
 def test_the_ports_of_this_computer_can_be_told_as_json():
-    for port in json.loads(json.dumps(ports_data())):
+    for port in json.loads(json.dumps(discovery.ports_data())):
         assert {"name", "path", "vendor", "by_path", "problem", "holders"} <= set(port)
 
 
-USB0, USB1 = SerialDevice("/dev/ttyUSB0", vendor="0403"), SerialDevice("/dev/ttyUSB1", vendor="1a86")
-BUILT_IN = SerialDevice("/dev/ttyS0")
+USB0, USB1 = (
+    discovery.SerialDevice("/dev/ttyUSB0", vendor="0403"),
+    discovery.SerialDevice("/dev/ttyUSB1", vendor="1a86"),
+)
+BUILT_IN = discovery.SerialDevice("/dev/ttyS0")
 
 
 @pytest.mark.parametrize(
@@ -205,7 +195,7 @@ BUILT_IN = SerialDevice("/dev/ttyS0")
     ],
 )
 def test_every_bus_gets_its_device(buses, text, devices):
-    assert parse_ports(buses, text) == devices
+    assert discovery.parse_ports(buses, text) == devices
 
 
 @pytest.mark.parametrize(
@@ -225,32 +215,26 @@ def test_every_bus_gets_its_device(buses, text, devices):
 )
 def test_what_leaves_a_bus_in_doubt_is_refused(buses, text, problem):
     with pytest.raises(ConfigError, match=rf"^--port {text!r}: {problem} \(sim, auto, .*DEVICE\)$"):
-        parse_ports(buses, text)
+        discovery.parse_ports(buses, text)
 
 
-def test_auto_takes_the_only_adapter_without_a_question():
+def test_auto_takes_the_adapter_that_has_the_servos_of_each_bus():
     def never(bus: str, device: str) -> bool:
         raise AssertionError("asked")
 
-    assert choose_ports(["main"], [BUILT_IN, USB0], never) == {"main": "/dev/ttyUSB0"}
-
-
-def test_auto_asks_each_adapter_for_the_servos_of_each_bus():
+    assert discovery.choose_ports(["main"], [BUILT_IN, USB0], never) == {"main": "/dev/ttyUSB0"}
     there = {("neck", "/dev/ttyUSB1"), ("face", "/dev/ttyUSB0")}
-    chosen = choose_ports(["neck", "face"], [USB0, USB1], lambda bus, device: (bus, device) in there)
+    chosen = discovery.choose_ports(["neck", "face"], [USB0, USB1], lambda bus, device: (bus, device) in there)
     assert chosen == {"neck": "/dev/ttyUSB1", "face": "/dev/ttyUSB0"}
+    with pytest.raises(PortError, match="no USB serial adapter is plugged in"):
+        discovery.choose_ports(["main"], [BUILT_IN])
+    with pytest.raises(ConfigError, match="no adapter has the servos of bus main .*/dev/ttyUSB0, /dev/ttyUSB1"):
+        discovery.choose_ports(["main"], [USB0, USB1], lambda bus, device: False)
 
 
 @pytest.mark.parametrize("probe", [None, lambda bus, device: True])
 def test_auto_does_not_guess_between_two(probe):
     with pytest.raises(ConfigError, match="2 adapters may be bus main .*/dev/ttyUSB0, /dev/ttyUSB1"):
-        choose_ports(["main"], [USB0, USB1], probe)
+        discovery.choose_ports(["main"], [USB0, USB1], probe)
     with pytest.raises(ConfigError, match="auto: .* bus face"):
-        choose_ports(["neck", "face"], [USB0], lambda bus, device: True)
-
-
-def test_auto_says_when_nothing_is_there():
-    with pytest.raises(PortError, match="no USB serial adapter is plugged in"):
-        choose_ports(["main"], [BUILT_IN])
-    with pytest.raises(ConfigError, match="no adapter has the servos of bus main .*/dev/ttyUSB0, /dev/ttyUSB1"):
-        choose_ports(["main"], [USB0, USB1], lambda bus, device: False)
+        discovery.choose_ports(["neck", "face"], [USB0], lambda bus, device: True)

@@ -18,14 +18,14 @@ def test_every_family_names_classes_that_there_are():
         assert isinstance(family.link_class(), type) and family.bauds and family.protocol in (1, 2)
 
 
-def test_unknown_family_is_refused_with_those_there_are():
+def test_a_family_that_cannot_be_had_is_one_line():
     with pytest.raises(ConfigError, match="herkulex.*is unknown.*dynamixel2.*ssc32"):
         family_named("herkulex")
-
-
-def test_board_has_no_registers_to_speak_of():
     with pytest.raises(ConfigError, match="Maestro: a board has no registers"):
         family_named("maestro").link_class()
+    for bus in ("sfms_nowhere:Bus", "math:sqrt"):
+        with pytest.raises(ConfigError, match=f"plug-in Theirs .*{bus}.*Error: "):
+            BusFamily("Theirs", bus, ("theirs", None)).build("not a number")
 
 
 HERKULEX = BusFamily("HerkuleX", "collections:OrderedDict", ("herkulex", None))
@@ -77,9 +77,3 @@ def test_a_plug_in_that_fails_is_named_once_and_left_out(installed, tmp_path, ca
     if line.startswith("other"):  # for the user who names it, its error is the error
         with pytest.raises(ConfigError, match=f"^plug-in other .*{problem}$"):
             family_named("other")
-
-
-def test_a_bus_of_a_plug_in_that_cannot_be_made_says_so():
-    for bus in ("sfms_nowhere:Bus", "math:sqrt"):
-        with pytest.raises(ConfigError, match=f"plug-in Theirs .*{bus}.*Error: "):
-            BusFamily("Theirs", bus, ("theirs", None)).build("not a number")

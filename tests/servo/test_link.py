@@ -59,22 +59,16 @@ def test_a_silent_servo_is_named_and_costs_a_bounded_time(model, tries):
     assert port.clock.t <= 3 * tries * (SILENCE_S + 0.0005)  # a write, a read back, and what the link asks to be sure
 
 
-def test_a_value_that_is_not_taken_is_told_with_both():
+def test_what_is_not_written_is_told_in_words():
     """A servo of the old frame acknowledges what it does not take: torque after a shutdown."""
     table, servo, port, link = rig("sts3215")
     servo.fail_named("overheating", port.clock.t)
     with pytest.raises(ServoError, match="id 1: torque_enable was set to 1 and reads 0"):
         finish(verified_write(link, 1, table.role("torque_enable"), 1))
-
-
-def test_a_refusal_is_told_in_words():
     table, _, _, link = rig("xl330-m288")
     finish(verified_write(link, 1, table["torque_enable"], 1))
     with pytest.raises(ServoError, match="id 1 refuses min_position_limit := 100: .*access"):
         finish(verified_write(link, 1, table["min_position_limit"], 100))
-
-
-def test_a_value_that_does_not_fit_is_refused_with_nothing_sent():
     table, _, port, link = rig("xl330-m288")
     with pytest.raises(ServoError, match="torque_enable = 300 does not fit"):
         finish(verified_write(link, 1, table["torque_enable"], 300))
@@ -134,15 +128,12 @@ def test_two_servos_with_one_id_are_told_from_one(protocol, pieces, answers, dup
     assert (replies.answers, replies.duplicate) == (answers, duplicate)
 
 
-def test_an_echo_is_no_second_servo():
+def test_an_echo_and_a_wire_that_never_falls_silent_are_no_second_servo():
     assert not heard(ONE, echo=True).duplicate
+    assert heard(*[b"\x55" * 100] * 1000).stray == 6400
 
 
 @pytest.mark.parametrize("shift", range(1, len(ONE)))
 def test_an_answer_that_begins_inside_the_other_is_a_duplicate_id(shift):
     overlap = bytes(a & b for a, b in zip(ONE[shift:] + b"\xff" * shift, OTHER, strict=True))
     assert heard(ONE[:shift] + overlap + OTHER[len(OTHER) - shift :]).duplicate
-
-
-def test_a_wire_that_never_falls_silent_is_left_alone():
-    assert heard(*[b"\x55" * 100] * 1000).stray == 6400

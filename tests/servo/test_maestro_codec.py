@@ -30,16 +30,13 @@ commands = st.one_of(
 )
 
 
-def test_commands_are_built_as_published():
+def test_commands_and_their_crc_are_those_published():
     assert BUILT.items() <= PUBLISHED.items()
+    assert maestro.sealed(CRC_PUBLISHED[:2]) == CRC_PUBLISHED
+    assert maestro.crc7(CRC_PUBLISHED) == 0
 
 
 CRC_PUBLISHED = bytes.fromhex("83 01 17")  # section 5.d of the guide
-
-
-def test_crc_is_the_published_one_and_over_a_packet_with_it_zero():
-    assert maestro.sealed(CRC_PUBLISHED[:2]) == CRC_PUBLISHED
-    assert maestro.crc7(CRC_PUBLISHED) == 0
 
 
 @given(words)
@@ -75,25 +72,19 @@ def test_no_target_changed_in_one_byte_gets_past_the_crc(addressed):
             assert taken.error or taken.code not in (maestro.SET_TARGET, maestro.SET_TARGETS), (at, change)
 
 
-def test_byte_that_becomes_ff_begins_a_command_without_a_crc():
+def test_damaged_interrupted_and_foreign_commands_leave_the_next_one_whole():
     wrong = bytearray(maestro.sealed(maestro.set_target(3, 2)))
     wrong[1] = maestro.MINI_SSC
     assert maybe_command(wrong, crc=True).error
     assert maybe_command(wrong, crc=True) == MaestroCommand(maestro.MINI_SSC, bytes([2, 0]))
+    buffer = bytearray(maestro.addressed(bytes([maestro.GO_HOME]), 3) + maestro.get_errors())
+    assert maybe_command(buffer, device=4) == MaestroCommand(maestro.GET_ERRORS)
+    buffer = bytearray(maestro.set_target(0, 6000)[:2] + maestro.set_target(1, 5000))
+    assert maybe_command(buffer) == MaestroCommand(maestro.SET_TARGET, error=maestro.PROTOCOL_ERROR)
+    assert maybe_command(buffer) == MaestroCommand(maestro.SET_TARGET, bytes([1]) + maestro.word(5000))
 
 
 @given(st.lists(commands, max_size=5))
 def test_commands_in_a_row_stay_apart(row):
     buffer = bytearray(b"".join(row))
     assert [maybe_command(buffer) for _ in row] == [MaestroCommand(c[0], c[1:]) for c in row]
-
-
-def test_commands_to_another_board_are_passed_over():
-    buffer = bytearray(maestro.addressed(bytes([maestro.GO_HOME]), 3) + maestro.get_errors())
-    assert maybe_command(buffer, device=4) == MaestroCommand(maestro.GET_ERRORS)
-
-
-def test_interrupted_command_is_an_error_and_the_next_one_counts():
-    buffer = bytearray(maestro.set_target(0, 6000)[:2] + maestro.set_target(1, 5000))
-    assert maybe_command(buffer) == MaestroCommand(maestro.SET_TARGET, error=maestro.PROTOCOL_ERROR)
-    assert maybe_command(buffer) == MaestroCommand(maestro.SET_TARGET, bytes([1]) + maestro.word(5000))

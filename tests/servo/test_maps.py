@@ -141,16 +141,17 @@ def test_a_map_in_the_users_folder_is_found_by_name_and_number(tmp_path, monkeyp
         load_firmware_map("sts3032")
 
 
-def test_firmware_without_a_layout_lists_those_at_hand(tmp_path):
+def test_a_map_that_cannot_be_had_is_named_with_those_at_hand(tmp_path):
     own = load_firmware_map(str(write(tmp_path, firmware={"min": 10})))
     assert variant(own, 10) is own
     with pytest.raises(ConfigError, match=r"firmware = 9 of made-up has no firmware map \(made-up 10..255\)"):
         variant(own, 9)
-
-
-def test_unknown_model_lists_those_at_hand():
     with pytest.raises(ConfigError, match=r"model = 'xl333' has no firmware map \(.*xl330-m288"):
         load_firmware_map("xl333")
+    file = tmp_path / "made-up.yaml"
+    file.write_text("model: made-up\nbaud_codes: {1: 9600, 1: 57600}\n", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"made-up.yaml:2: 1 is given twice"):
+        load(FirmwareMap, file)
 
 
 WRONG = {
@@ -187,13 +188,6 @@ def test_wrong_map_is_refused_with_its_reason(problem):
         parse(FirmwareMap, MADE_UP | WRONG[problem], "made-up.yaml")
 
 
-def test_baud_code_given_twice_is_refused(tmp_path):
-    file = tmp_path / "made-up.yaml"
-    file.write_text("model: made-up\nbaud_codes: {1: 9600, 1: 57600}\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"made-up.yaml:2: 1 is given twice"):
-        load(FirmwareMap, file)
-
-
 def test_board_of_the_example_is_sound():
     assert parse(FirmwareMap, MADE_UP | BOARD, "made-up.yaml").channels == 4
 
@@ -215,9 +209,10 @@ def test_check_finds_what_two_maps_cannot_both_say(tmp_path, changes, problem):
     assert any(problem in each.problem for each in found)
 
 
-def test_check_finds_a_file_under_another_name(tmp_path):
+def test_check_finds_another_name_and_allows_one_number_where_the_map_says_so(tmp_path):
     file = write(tmp_path).rename(tmp_path / "other.yaml")
     assert [each.problem for each in check_maps([file])] == ["model = 'made-up' is not the file's name (other)"]
+    assert check_maps([write(tmp_path, model_number=12, same_number_as="ax-12a")]) == []
 
 
 def test_one_number_is_fine_for_two_firmwares(tmp_path):
@@ -229,23 +224,13 @@ def test_one_number_is_fine_for_two_firmwares(tmp_path):
     assert found.problem == "model_number = 60000 is also made-up, for some of the same firmware"
 
 
-def test_one_number_is_fine_where_the_map_says_so(tmp_path):
-    assert check_maps([write(tmp_path, model_number=12, same_number_as="ax-12a")]) == []
-
-
-def test_command_lists_the_models():
+def test_the_command_lists_and_checks_maps(tmp_path):
     rows = json.loads(CliRunner().invoke(CLI, ["--json"]).stdout)["maps"]
     assert sorted(row["model"] for row in rows) == sorted(MODELS)
     shown = CliRunner().invoke(CLI, []).stdout
     assert "xl330-m288_fw52" in shown and "maestro-24" in shown
-
-
-def test_command_checks_the_shipped_maps():
     result = CliRunner().invoke(CLI, ["--check", "--json"])
     assert result.exit_code == 0 and json.loads(result.stdout) == {"sound": True, "findings": []}
-
-
-def test_command_fails_on_a_wrong_map(tmp_path):
     file = write(tmp_path, registers={})
     result = CliRunner().invoke(CLI, ["--check", str(file)])
     assert result.exit_code == 2 and f"{file}: registers is empty" in result.stdout

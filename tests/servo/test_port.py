@@ -14,14 +14,7 @@ import serial
 from virtual_time import Time
 
 from sfms_robot.errors import BusError, PortError
-from sfms_robot.servo.port import (
-    DEVICE_ERRORS,
-    PolledIO,
-    RtsDirection,
-    SerialPort,
-    VirtualTimePort,
-    serial_io,
-)
+from sfms_robot.servo.port import DEVICE_ERRORS, PolledIO, RtsDirection, SerialPort, VirtualTimePort, serial_io
 
 
 @contextmanager
@@ -215,15 +208,12 @@ class Line:
         self.done.append("sent")
 
 
-def test_rts_is_on_from_before_the_first_byte_until_the_last_has_left():
+def test_rts_is_on_from_before_the_first_byte_until_the_last_has_left_or_writing_fails():
     line = Line()
     io = RtsDirection(line, line, "ttyAMA0")
     io.write(b"goal")
     assert line.done == [False, True, b"goal", "sent", False]
     assert io.read(3, 0.0) == b"ans" and line.done[-1] is False
-
-
-def test_rts_is_off_again_when_writing_fails():
     line = Line(broken=True)
     with pytest.raises(BusError):
         RtsDirection(line, line, "ttyAMA0").write(b"goal")

@@ -31,17 +31,24 @@ def test_known_requests_mean_what_their_names_say():
     sync = frame_of("sync read pos+speed (56,4) ids 1 2")
     assert protocol1.sync_read_params(56, 4, [1, 2]) == sync.params
     assert frame_of("clear turns id1").code == protocol1.RESET_TURNS
+    bulk = encode(protocol1.BROADCAST, protocol1.BULK_READ, protocol1.bulk_read_params([(1, 0x1E, 2), (2, 0x24, 2)]))
+    assert bulk.hex() == "fffffe09920002011e0202241d"  # the example of the e-manual
 
 
 @given(ids, codes, params)
 def test_round_trip(servo, code, data):
     assert take(bytearray(encode(servo, code, data))) == Frame(servo, code, data)
+    assert take(bytearray(b"\xff" + encode(servo, code, data))) == Frame(servo, code, data)  # a third FF is header
 
 
-def test_frame_too_long_for_its_length_byte_is_refused():
+def test_lengths_that_no_frame_has_are_refused_or_pass_where_a_parameter_is_the_right_sum():
     assert len(encode(1, 3, bytes(protocol1.MAX_PARAMS))) == protocol1.MAX_FRAME
     with pytest.raises(PacketError, match="254 parameters is longer than 253"):
         encode(1, 3, bytes(254))
+    wrong = bytearray(encode(1, protocol1.WRITE, b"\x1e\x01\x02\xd5"))
+    assert take(bytearray(wrong)) is not None
+    wrong[3] = 5
+    assert take(wrong) == Frame(1, protocol1.WRITE, b"\x1e\x01\x02")  # as sent, and the rest is lost
 
 
 @given(params, st.integers(1, 200))
@@ -72,13 +79,6 @@ def test_any_change_of_one_byte_but_the_length_is_detected(at):
         wrong = bytearray(SYNC_WRITE)
         wrong[at] ^= change
         assert salvage(wrong) == []
-
-
-def test_changed_length_passes_where_a_parameter_happens_to_be_the_right_sum():
-    wrong = bytearray(encode(1, protocol1.WRITE, b"\x1e\x01\x02\xd5"))
-    assert take(bytearray(wrong)) is not None
-    wrong[3] = 5
-    assert take(wrong) == Frame(1, protocol1.WRITE, b"\x1e\x01\x02")  # as sent, and the rest is lost
 
 
 def test_error_bits_about_the_request_are_told_from_those_about_the_servo():

@@ -93,10 +93,7 @@ EVENTS = st.lists(st.tuples(st.integers(0, 40), st.sampled_from(["unplug", "plug
 
 @example(events=[(0, "unplug")], ticks=0, last="torque_off", model="maestro-24")
 @given(
-    events=EVENTS,
-    ticks=st.integers(0, 40),
-    last=st.sampled_from(["stop", "torque_off"]),
-    model=st.sampled_from(KINDS),
+    events=EVENTS, ticks=st.integers(0, 40), last=st.sampled_from(["stop", "torque_off"]), model=st.sampled_from(KINDS)
 )
 def test_stop_ends_the_pulses_of_a_board_that_can_be_reached_and_of_one_that_comes_back(events, ticks, last, model):
     bench = ConnectedBench(model)

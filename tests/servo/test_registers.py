@@ -68,13 +68,10 @@ def test_table_survives_json(model):
     assert Table.from_plain(json.loads(json.dumps(firmware_map.model_dump(mode="json")))) == Table.of(firmware_map)
 
 
-def test_faults_are_named():
+def test_faults_and_the_error_byte_name_what_is_the_servos():
     assert X.fault_names(0) == ""
     assert X.fault_names(0b100100) == "overheating, overload"
     assert X.fault_names(0b10) == "hardware error bit 1"
-
-
-def test_error_byte_of_protocol_1_names_the_servos_faults_and_not_the_packets():
     assert AX.status_fault_names(0b0110_0100) == "overheating, overload"
     assert AX.status_fault_names(0b0001_0000) == ""
 
@@ -99,18 +96,12 @@ def test_lock_until_power_off_is_not_the_lock_that_tools_open_and_close():
     assert STS.role("lock") == STS["lock"]
 
 
-def test_board_has_channels_and_no_registers():
+def test_channels_speed_and_factory_baud_rate_are_read_from_the_map():
     assert (MAESTRO.channels, MAESTRO.tick_us, MAESTRO.protocol, MAESTRO.size) == (24, 0.25, None, 0)
     assert MAESTRO.center_ticks * MAESTRO.tick_us == 1500.0
     assert MAESTRO.role("present_position") is None
-
-
-def test_unknown_speed_is_assumed_and_a_known_one_is_not():
     unknown = Table.of(load_firmware_map("sts3032"))
     assert unknown.top_speed_ticks_s == pytest.approx(ASSUMED_SPEED_DEG_S * 4096 / 360)
     assert X.top_speed_ticks_s == pytest.approx(618 * 4096 / 360)
-
-
-def test_factory_baud_rate_is_read_from_the_map():
     assert [table.default_baud for table in SERVOS.values()] == [57_600, 1_000_000, 57_600, 1_000_000, 1_000_000]
     assert MAESTRO.default_baud is None

@@ -48,12 +48,10 @@ def test_reader_gives_back_what_the_builder_made(moves, time_ms):
     assert maybe_command(buffer) == Group(moves, time_ms) and buffer == b"Q"
 
 
-def test_escape_throws_away_what_came_before_it():
+def test_escape_throws_away_what_came_before_it_and_several_pulses_are_asked_for_at_once():
     assert maybe_command(bytearray(b"#5P2000\x1b#5P1500\r")) == Group({5: Move(1500)})
-
-
-def test_several_pulses_are_asked_for_at_once():
     assert maybe_command(bytearray(b"QP 5 31\r")) == Query("QP", (5, 31))
+    assert maybe_command(bytearray(ssc32.outputs_low([3, 4]))) == Group({}, levels={3: False, 4: False})
 
 
 @pytest.mark.parametrize("line", [b"", b"#32P1500", b"QP 40", b"hello", b"#5", b"P1500", b"#5P1500T99999999"])

@@ -49,8 +49,6 @@ class Rig(ServoRig):
 
 
 # --- who is there -----------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("model", MODELS)
 def test_absent_servos_do_not_stop_the_others(model):
     rig = Rig(model, {"id": 1}, {"id": 3}, wanted=[1, 2, 3, 4])
@@ -83,8 +81,6 @@ def test_a_servo_that_was_away_and_is_mute_is_silent_and_not_refused():
 
 
 # --- position limits --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("model", MODELS)
 @given(data=st.data())
 def test_a_unit_is_refused_exactly_when_a_goal_of_its_joint_lies_outside_its_limits(model, data):
@@ -104,8 +100,6 @@ def test_a_unit_is_refused_exactly_when_a_goal_of_its_joint_lies_outside_its_lim
 
 
 # --- zero and direction -----------------------------------------------------------------------------------------
-
-
 MOVES_WRONGLY = [  # model, register, stored, declared (None: nothing), what is wrong
     ("xl330-m288", "homing_offset", 100, 612, "every angle would be -45.0 deg off"),
     ("xl330-m288", "homing_offset", 512, None, "every angle would be +45.0 deg off"),
@@ -156,8 +150,6 @@ def test_the_one_turn_of_an_sts_that_counts_turns_is_shifted_by_its_offset_with_
 
 
 # --- what acts by itself ----------------------------------------------------------------------------------------
-
-
 def test_torque_at_power_up_is_refused():
     rig = Rig("xl330-m288", {"registers": {"startup_configuration": 3}})
     with pytest.raises(ServoError, match="startup_configuration is 3, wanted 2: its torque comes on at power-up"):
@@ -182,8 +174,6 @@ def test_a_servo_as_it_leaves_the_factory_contradicts_nothing(model):
 
 
 # --- turns ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("model", WITH_TURNS)
 @pytest.mark.parametrize("found", [4150, -100, 9000])
 def test_a_joint_turned_by_hand_past_one_turn_starts_where_it_stands(model, found):
@@ -219,7 +209,6 @@ def test_an_offset_shifts_the_one_turn_that_there_is():
 
 
 # --- more than one turn -----------------------------------------------------------------------------------------
-
 GEARED = {"ratio": 4.0, "limit_rad": 1.2}  # 2048 +- 3129 ticks
 
 
@@ -262,8 +251,6 @@ def test_a_geared_joint_that_kept_its_torque_kept_its_count():
 
 
 # --- settings ---------------------------------------------------------------------------------------------------
-
-
 def test_a_register_above_those_that_are_polled_is_written_too():
     """XL-320: punch lies behind everything that tells the present."""
     rig = Rig("xl-320", safety=Safety(registers={"punch": 40}))

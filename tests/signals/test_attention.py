@@ -40,8 +40,13 @@ def at_head(t):
     return {}
 
 
-def test_no_face_is_no_number():
+def test_no_face_and_a_track_of_the_mouth_alone_tell_nothing():
     assert attend(None, None, AttentionState())[0] is None
+    track = read_track(data_dir("sim") / "speakers" / "facegood_1114_3_16" / "face.csv.gz")
+    state = AttentionState()
+    for time_s, row in zip(track.times_s, track.motion, strict=True):
+        attention, state = attend(FaceFrame.of(float(time_s), row), None, state)
+        assert attention is None
 
 
 def test_a_blink_changes_nothing_and_eyes_kept_shut_look_at_nothing():
@@ -102,11 +107,3 @@ def test_whoever_comes_after_a_while_starts_from_nothing():
     _, state = attentions(lambda t: {"head_deg": (18.0, 0.0)}, 20.0)
     later, _ = attend(face(state.time_s + 11.0), None, state)
     assert later > 0.95
-
-
-def test_a_track_of_the_mouth_alone_tells_nothing():
-    track = read_track(data_dir("sim") / "speakers" / "facegood_1114_3_16" / "face.csv.gz")
-    state = AttentionState()
-    for time_s, row in zip(track.times_s, track.motion, strict=True):
-        attention, state = attend(FaceFrame.of(float(time_s), row), None, state)
-        assert attention is None

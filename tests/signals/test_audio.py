@@ -27,10 +27,12 @@ def test_any_rate_becomes_the_same_tone_at_16_khz(tmp_path, rate_hz, suffix):
     np.testing.assert_allclose(samples[500:7500], tone(16000)[500:7500], atol=0.005)
 
 
-def test_level_is_in_decibels_of_full_scale():
+def test_level_is_in_decibels_of_full_scale_and_a_constant_stays_one():
     assert energy_db(np.ones(100, dtype=np.float32)) == pytest.approx(0.0)
     assert energy_db(np.full(100, 0.1, dtype=np.float32)) == pytest.approx(-20.0, abs=1e-4)
     assert energy_db(np.zeros(0, dtype=np.float32)) == energy_db(np.zeros(640, dtype=np.float32)) == -100.0
+    assert at_positions(np.ones(200, np.float32), np.linspace(50, 150, 333)) == pytest.approx(np.ones(333), abs=1e-6)
+    assert at_positions(np.ones(3, np.float32), np.zeros(0)).shape == (0,)
 
 
 UNUSABLE = {
@@ -115,11 +117,6 @@ def test_at_whole_positions_samples_are_what_they_are_and_0_around_them(seed, sh
     positions = np.arange(shift, shift + 40, dtype=float)
     expected = np.pad(samples, 100)[100 + shift : 140 + shift]
     np.testing.assert_allclose(at_positions(samples, positions), expected, atol=1e-6)
-
-
-def test_a_constant_stays_one():
-    assert at_positions(np.ones(200, np.float32), np.linspace(50, 150, 333)) == pytest.approx(np.ones(333), abs=1e-6)
-    assert at_positions(np.ones(3, np.float32), np.zeros(0)).shape == (0,)
 
 
 VOICE = np.random.default_rng(3).normal(0, 0.1, 64_000).astype(np.float32)

@@ -44,33 +44,27 @@ def test_rows_are_finite_and_bounded_whatever_the_events(events):
     assert np.isfinite(rows).all() and np.abs(rows).max() <= BOUND
 
 
-def test_of_two_events_of_one_kind_the_later_one_is_told():
-    first = ListenerEvent("nod", 0.0, 2.0, 0.05, swings=4)
-    second = ListenerEvent("nod", 0.4, 0.6, 0.1, swings=1)
-    together, alone = control_track([second, first], 0, 50), control_track([second], 0, 50)
-    during = slice(10, 24)  # 0.44 to 0.96 s
-    np.testing.assert_array_equal(together[during], alone[during])
-    np.testing.assert_array_equal(together[30:], control_track([first], 0, 50)[30:])  # the first goes on behind it
-
-
-def test_kinds_do_not_meet():
+def test_kinds_do_not_meet_and_a_gaze_shift_is_not_told():
     nod, smile = ListenerEvent("nod", 0.2, 1.0, 0.1, swings=2), ListenerEvent("smile", 0.5, 2.0, 0.6)
     both = control_track([nod, smile], 0, 80)
     np.testing.assert_array_equal(both, control_track([nod], 0, 80) + control_track([smile], 0, 80))
-
-
-def test_a_gaze_shift_is_not_told():
     shift = ListenerEvent("gaze_shift", 0.0, 1.0, 0.3, target_rad=(0.2, 0.0))
     assert not control_track([shift], 0, 40).any()
 
 
-def test_a_swing_is_where_the_head_is_in_it():
+def test_a_swing_is_where_the_head_is_in_it_and_of_two_events_of_a_kind_the_later_is_told():
     rows = control_track([ListenerEvent("nod", 0.0, 1.0, 0.1, swings=2)], -1, 26)  # at 0, 0.04, ... s
     angle = 2 * np.pi * 2 * np.arange(25) / 25
     np.testing.assert_allclose(rows[:25, column("nod.sine")], np.sin(angle), atol=1e-6)
     np.testing.assert_allclose(rows[:25, column("nod.cosine")], np.cos(angle), atol=1e-6)
     np.testing.assert_allclose(rows[:25, column("nod.over")], np.arange(25) / 25, atol=1e-6)
     assert not rows[25].any()  # over
+    first = ListenerEvent("nod", 0.0, 2.0, 0.05, swings=4)
+    second = ListenerEvent("nod", 0.4, 0.6, 0.1, swings=1)
+    together, alone = control_track([second, first], 0, 50), control_track([second], 0, 50)
+    during = slice(10, 24)  # 0.44 to 0.96 s
+    np.testing.assert_array_equal(together[during], alone[during])
+    np.testing.assert_array_equal(together[30:], control_track([first], 0, 50)[30:])  # the first goes on behind it
 
 
 def test_every_kind_has_its_columns_and_swinging_ones_two_more():

@@ -41,19 +41,15 @@ def test_a_blink_is_counted_against_lids_that_rest_half_closed_and_a_long_closur
     assert len(find_blinks(one_frame, 25.0)) == 2
 
 
-def test_a_smile_lasts_and_ends_where_it_has_fallen_by_half(time_s):
+def test_a_smile_lasts_and_ends_where_it_has_fallen_by_half_and_runs_are_half_open(time_s):
     smile = np.clip(1.2 - np.abs(time_s - 4), 0, 1)
     ((start_s, end_s, peak),) = find_smiles(smile, rate_of(time_s))
     assert (start_s, end_s, peak) == (pytest.approx(2.9, abs=0.05), pytest.approx(5.1, abs=0.05), 1.0)
     assert not find_smiles(np.where(np.abs(time_s - 4) < 0.15, 0.9, 0.15), rate_of(time_s))
-
-
-def test_runs_are_half_open():
     assert runs([1, 1, 0, 1]) == [(0, 2), (3, 4)] and runs([]) == []
 
 
 # --- What stands in for scipy.signal, beside it ---------------------------------------------------------------------
-
 LEVELS = strategies.one_of(strategies.integers(-3, 3).map(float), strategies.floats(-2, 2, width=16))
 
 

@@ -44,7 +44,7 @@ def nod(frames, size_rad, length_s=0.5, at=30):
 
 
 @given(st.lists(TARGETS, min_size=1, max_size=6), SEEDS)
-def test_a_whole_is_its_frames_one_by_one(places, seed):
+def test_a_whole_is_its_frames_one_by_one_and_mirrored_targets_give_mirrored_motion(places, seed):
     targets = np.repeat(places, 9, axis=0)
     poses = np.random.default_rng(seed).normal(0, 0.02, (len(targets), 6))
     head, eyes, states = gaze.follow(targets, poses, gaze.start(seed))
@@ -54,6 +54,13 @@ def test_a_whole_is_its_frames_one_by_one(places, seed):
         np.testing.assert_array_equal(one_head[0], head[row])
         np.testing.assert_array_equal(one_eyes[0], eyes[row])
         assert state == states[row]
+    targets = np.repeat(places, 12, axis=0)
+    poses = np.zeros((len(targets), 6))
+    state = gaze.start(seed, wanders=False)
+    one, _ = played(targets, poses, state)
+    two, _ = played(targets * [-1, 1], poses, state)
+    np.testing.assert_allclose(two[:, :3], one[:, :3] * [-1, 1, -1], atol=1e-6)
+    np.testing.assert_allclose(gaze_of(two), gaze_of(one) * [-1, 1], atol=1e-6)
 
 
 @given(TARGETS, TARGETS, SEEDS)
@@ -76,7 +83,7 @@ def test_eyes_hold_their_target_while_the_head_nods(seed, target):
 
 
 @given(SEEDS)
-def test_the_eyes_leave_first_and_the_head_arrives_after_them(seed):
+def test_the_eyes_leave_first_and_the_head_follows_more_for_a_larger_shift(seed):
     targets = shift(np.zeros(2), np.radians([24.0, 0.0]))
     motion, head = played(targets, np.zeros((75, 6)), gaze.start(seed, wanders=False))
     yaw, final = gaze_of(motion)[:, 0], head[-1, 2]
@@ -88,10 +95,6 @@ def test_the_eyes_leave_first_and_the_head_arrives_after_them(seed):
     speed = np.diff(head[24:, 2])
     peak = int(speed.argmax())
     assert (np.diff(speed[: peak + 1]) > -1e-6).all() and (np.diff(speed[peak:]) < 1e-6).all()  # one bell
-
-
-@given(SEEDS)
-def test_the_head_hardly_moves_for_a_small_shift_and_has_a_larger_share_of_a_larger_one(seed):
     state = gaze.start(seed)
     shares = [
         gaze.head_share((math.radians(size), 0.0), state.share)[0] / math.radians(size) for size in (4, 8, 16, 28)
@@ -109,22 +112,14 @@ def test_the_head_never_jumps_and_neither_does_its_speed(places, seed, held):
     assert np.degrees(np.abs(np.diff(speed, axis=0)).max() / FRAME_S) < 1600
 
 
-def test_a_still_target_keeps_the_head_where_it_is():
+def test_a_still_target_keeps_the_head_where_it_is_and_a_slow_one_is_followed_without_a_shift():
     targets = shift(np.zeros(2), np.radians([20.0, 6.0]), 5, 200)
     head, _, _ = gaze.follow(targets, np.zeros((205, 6)), gaze.start(3))
     assert np.ptp(head[40:], axis=0).max() == 0
     assert head[40, 2] > 0 and head[40, 1] > 0
-
-
-@given(st.lists(TARGETS, min_size=1, max_size=6), SEEDS)
-def test_mirrored_targets_give_mirrored_motion(places, seed):
-    targets = np.repeat(places, 12, axis=0)
-    poses = np.zeros((len(targets), 6))
-    state = gaze.start(seed, wanders=False)
-    one, _ = played(targets, poses, state)
-    two, _ = played(targets * [-1, 1], poses, state)
-    np.testing.assert_allclose(two[:, :3], one[:, :3] * [-1, 1, -1], atol=1e-6)
-    np.testing.assert_allclose(gaze_of(two), gaze_of(one) * [-1, 1], atol=1e-6)
+    targets = np.radians(np.stack([np.linspace(0, 15, 200), np.zeros(200)], axis=1))
+    motion, _ = played(targets, np.zeros((200, 6)), gaze.start(1, wanders=False))
+    assert np.degrees(np.abs(gaze_of(motion) - targets)[1:]).max() < 0.2
 
 
 def test_eyes_wander_over_what_they_look_at_as_peoples_do():
@@ -135,12 +130,6 @@ def test_eyes_wander_over_what_they_look_at_as_peoples_do():
     assert 0.2 < np.median(np.diff(shifts)) * FRAME_S < 0.32  # 228 ms, in frames of 40
     assert 0.6 < np.degrees(np.median(steps[shifts])) < 1.2
     assert np.degrees(np.hypot(*where.T)).max() < 1.5
-
-
-def test_a_target_that_moves_slowly_is_followed_without_a_shift():
-    targets = np.radians(np.stack([np.linspace(0, 15, 200), np.zeros(200)], axis=1))
-    motion, _ = played(targets, np.zeros((200, 6)), gaze.start(1, wanders=False))
-    assert np.degrees(np.abs(gaze_of(motion) - targets)[1:]).max() < 0.2
 
 
 @pytest.mark.parametrize("target, pitch", [((np.nan, 0), 0), ((0, np.inf), 0), ((0, 0), np.nan)])

@@ -78,22 +78,22 @@ def test_frames_do_not_depend_on_how_the_stream_was_cut(sizes):
         assert one.voice == other.voice
 
 
-def test_echo_is_taken_away():
+def test_echo_that_was_played_or_is_expected_is_taken_away():
     said = own_speech(8.0)
     heard = echo_of(said) + noise(len(said), -75)
     after = EchoCanceller().push(heard, said).audio
     loud = slice(4 * 16000, 8 * 16000)
     assert energy_db(after[loud]) < energy_db(heard[loud]) - 25
+    hum = noise(640, -30)
+    power = np.full((4, 161), 160 * 10 ** (-30 / 10))
+    assert energy_db(MotorNoise().suppress(hum, 0.0, power)) < energy_db(MotorNoise().suppress(hum, 0.0)) - 6
 
 
-def test_without_a_reference_the_microphone_passes_late_and_unchanged():
+def test_without_a_reference_the_microphone_passes_late_and_unchanged_and_no_echo_is_expected():
     mic = talk("caller", 10.0, 2.0)
     after = EchoCanceller().push(mic, np.zeros_like(mic)).audio
     np.testing.assert_array_equal(after[ECHO_LATENCY_SAMPLES:], mic[: len(after) - ECHO_LATENCY_SAMPLES])
     assert ECHO_LATENCY_SAMPLES <= 160  # 10 ms
-
-
-def test_the_filter_expects_no_echo_where_nothing_was_said_and_some_where_something_is():
     said = own_speech(2.0)
     heard = echo_of(said)
     assert not EchoCanceller().push(heard, np.zeros_like(said)).residual_power.any()
@@ -134,12 +134,6 @@ def test_learned_motor_noise_is_taken_away_and_at_another_speed_nothing_is():
     assert SUPPRESSION_LATENCY_SAMPLES <= 160  # 10 ms
 
 
-def test_echo_that_is_expected_is_taken_away():
-    hum = noise(640, -30)
-    power = np.full((4, 161), 160 * 10 ** (-30 / 10))
-    assert energy_db(MotorNoise().suppress(hum, 0.0, power)) < energy_db(MotorNoise().suppress(hum, 0.0)) - 6
-
-
 @given(st.lists(st.floats(-90, 0), min_size=2, max_size=20), st.floats(0, 30))
 def test_what_is_left_of_a_frame_is_never_more_than_it_was_nor_less_than_the_least_gain(levels_db, speed_rad_s):
     motors = MotorNoise()
@@ -168,27 +162,21 @@ def test_what_is_not_finite_is_heard_as_silence_and_forgotten(value):
     assert total_speed([value, 0.5, -0.25]) == 0.75
 
 
-def test_a_network_that_heard_noise_and_then_nobody_begins_anew():
+def test_a_network_begins_anew_after_noise_and_then_nobody_and_never_otherwise():
     hum, voice = noise(FORGETS_WINDOWS * WINDOW, -40), talk("caller", 10.0, 2.0)
     used, fresh = SpeechProbability(), SpeechProbability()
     assert max(used.push(hum, noise=True)) < 0.1
     assert used.push(voice) == fresh.push(voice)
-
-
-def test_a_network_that_never_heard_noise_never_begins_anew():
     quiet, voice = np.zeros(3 * FORGETS_WINDOWS * WINDOW, np.float32), talk("caller", 10.0, 2.0)
     used, fresh = SpeechProbability(), SpeechProbability()
     used.push(quiet)
     assert used.push(voice) != fresh.push(voice)
 
 
-def test_a_window_is_judged_when_it_is_whole():
+def test_a_window_is_judged_when_it_is_whole_and_what_does_not_fit_is_refused():
     speech = SpeechProbability()
     assert speech.push(np.zeros(WINDOW - 1, np.float32)) == []
     assert len(speech.push(np.zeros(1 + WINDOW, np.float32))) == 2
-
-
-def test_what_does_not_fit_is_refused_in_one_line():
     mic = np.zeros(160, np.float32)
     with pytest.raises(InputError, match="160 and 80 samples"):
         OwnVoiceGate().push(mic, mic[:80])

@@ -29,12 +29,9 @@ def test_many_values_give_quantiles_within_a_percent(percent, seed):
     assert taken(values).at(percent) == pytest.approx(np.percentile(values, percent, method="inverted_cdf"), rel=0.012)
 
 
-def test_the_largest_is_exact_and_zeros_stay_zeros():
+def test_the_largest_is_exact_zeros_stay_zeros_and_nothing_taken_is_none():
     quantiles = taken([*[0.0] * 10_000, 123.456])
     assert (quantiles.at(50), quantiles.at(100), len(quantiles)) == (0.0, 123.456, 10_001)
-
-
-def test_nothing_taken_is_none_in_a_report_and_an_error_when_asked():
     assert Quantiles().report(p50=50) == {"p50": None}
     with pytest.raises(ValueError, match="no value"):
         Quantiles().at(50)

@@ -5,21 +5,7 @@ import pytest
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS, SHAPES
-from sfms_robot.signals.spaces import (
-    JAW_FULL_OPEN_RAD,
-    SPACES,
-    FlameMatrix,
-    LiveUnits,
-    beyond,
-    bounded_least_squares,
-    channel_of,
-    decode,
-    encode,
-    limitation,
-    read_matrix,
-    units_of,
-    used_line,
-)
+from sfms_robot.signals import spaces
 
 RNG = np.random.default_rng(5)
 MATRIX = RNG.normal(size=(52, 50))
@@ -33,7 +19,7 @@ def faces(count=40):
     return motion
 
 
-@pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
+@pytest.mark.parametrize("space", spaces.SPACES.values(), ids=spaces.SPACES)
 def test_axes_are_a_rotation(space):
     axes = np.array(space.axes)
     assert np.array_equal(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
@@ -41,40 +27,38 @@ def test_axes_are_a_rotation(space):
 
 def test_faceverse_and_back_is_the_same_face():
     motion = faces()
-    neutral = encode(np.zeros((1, 58)))[0]
-    back, jaw_rad = decode(encode(motion, metres_per_unit=1.0), "faceverse58", neutral=neutral, metres_per_unit=1.0)
+    neutral = spaces.encode(np.zeros((1, 58)))[0]
+    frames = spaces.encode(motion, metres_per_unit=1.0)
+    back, jaw_rad = spaces.decode(frames, "faceverse58", neutral=neutral, metres_per_unit=1.0)
     assert np.abs(back - motion).max() < 1e-5 and jaw_rad is None
 
 
-def test_faceverse_neutral_looks_straight_ahead():
+def test_faceverse_neutral_looks_straight_ahead_and_its_translation_has_no_metric_scale():
     frame = np.zeros((1, 58))
     frame[0, 52] = np.pi
-    assert np.abs(decode(frame, "faceverse58")[0]).max() < 1e-6
-
-
-def test_faceverse_translation_has_no_metric_scale():
-    frames = encode(faces())
-    assert not decode(frames, "faceverse58")[0][:, 3:6].any()
+    assert np.abs(spaces.decode(frame, "faceverse58")[0]).max() < 1e-6
+    frames = spaces.encode(faces())
+    assert not spaces.decode(frames, "faceverse58")[0][:, 3:6].any()
 
 
 @pytest.mark.parametrize(("index", "channel"), [(50, "pitch"), (51, "yaw"), (52, "roll")])
 def test_flame_turns_about_its_own_axes(index, channel):
     frame = np.zeros((1, 56))
     frame[0, index] = 0.3
-    pose = decode(frame, "deca56")[0][0, :6]
+    pose = spaces.decode(frame, "deca56")[0][0, :6]
     assert pose[CHANNEL_INDEX[channel]] == pytest.approx(0.3, abs=1e-6)
     assert np.count_nonzero(np.abs(pose) > 1e-6) == 1
 
 
 def test_without_a_matrix_pose_and_jaw_move_and_it_says_so():
     frames = RNG.normal(size=(5, 56))
-    frames[:, 53] = JAW_FULL_OPEN_RAD / 2
-    motion, jaw_rad = decode(frames, "deca56")
-    assert "pose and jaw only" in (limitation("deca56", None) or "")
+    frames[:, 53] = spaces.JAW_FULL_OPEN_RAD / 2
+    motion, jaw_rad = spaces.decode(frames, "deca56")
+    assert "pose and jaw only" in (spaces.limitation("deca56", None) or "")
     shapes = motion[:, SHAPES]
     assert shapes[:, BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5)
     assert np.count_nonzero(shapes) == len(frames)
-    assert jaw_rad is not None and jaw_rad[:, 1] == pytest.approx(JAW_FULL_OPEN_RAD / 2)
+    assert jaw_rad is not None and jaw_rad[:, 1] == pytest.approx(spaces.JAW_FULL_OPEN_RAD / 2)
 
 
 def test_expression_comes_back_through_the_matrix():
@@ -83,14 +67,14 @@ def test_expression_comes_back_through_the_matrix():
     weights[:, shown] = RNG.uniform(0.2, 0.9, (30, 1))
     frames = np.zeros((30, 56))
     frames[:, :50] = weights @ MATRIX
-    motion, _ = decode(frames, "deca56", flame=FlameMatrix(MATRIX))
-    assert limitation("deca56", FlameMatrix(MATRIX)) is None
+    motion, _ = spaces.decode(frames, "deca56", flame=spaces.FlameMatrix(MATRIX))
+    assert spaces.limitation("deca56", spaces.FlameMatrix(MATRIX)) is None
     assert np.abs(motion[:, SHAPES] - weights).mean() < 0.02
     assert np.abs(motion[:, SHAPES][:, shown] - weights[:, shown]).max() < 0.1
 
 
 def test_solved_weights_are_bounded_and_gaze_stays_still():
-    weights = FlameMatrix(MATRIX).solve(RNG.normal(scale=5, size=(20, 50)), np.zeros(20))
+    weights = spaces.FlameMatrix(MATRIX).solve(RNG.normal(scale=5, size=(20, 50)), np.zeros(20))
     assert weights.min() >= 0 and weights.max() <= 1
     assert not weights[:, [name.startswith("eyeLook") for name in BLENDSHAPES]].any()
 
@@ -98,7 +82,7 @@ def test_solved_weights_are_bounded_and_gaze_stays_still():
 def test_bounded_solution_cannot_be_bettered():
     """Where an unknown is free its slope is 0; at a bound the slope points outward (the optimality conditions)."""
     matrix, wanted = RNG.normal(size=(30, 8)), RNG.normal(scale=3, size=(25, 30))
-    x = bounded_least_squares(matrix, wanted, np.full(8, -0.2), np.full(8, 0.5))
+    x = spaces.bounded_least_squares(matrix, wanted, np.full(8, -0.2), np.full(8, 0.5))
     slope = (x @ matrix.T - wanted) @ matrix
     at_low, at_high = x <= -0.2, x >= 0.5
     assert np.abs(slope[~at_low & ~at_high]).max() < 1e-4
@@ -110,8 +94,8 @@ def test_matrix_files_of_both_kinds_are_the_same_matrix(tmp_path):
     np.save(tmp_path / "m.npy", by_order)
     lines = [",".join([name, *map(repr, row.tolist())]) for name, row in zip(ORDERS["apple"], by_order, strict=True)]
     (tmp_path / "m.csv").write_text("\n".join(lines))
-    assert np.array_equal(read_matrix(tmp_path / "m.npy", "apple").rows, MATRIX)
-    assert np.array_equal(read_matrix(tmp_path / "m.csv").rows, MATRIX)
+    assert np.array_equal(spaces.read_matrix(tmp_path / "m.npy", "apple").rows, MATRIX)
+    assert np.array_equal(spaces.read_matrix(tmp_path / "m.csv").rows, MATRIX)
 
 
 @pytest.mark.parametrize(
@@ -121,17 +105,17 @@ def test_matrix_files_of_both_kinds_are_the_same_matrix(tmp_path):
 def test_bad_matrix_is_told_in_one_line(tmp_path, text, told):
     (tmp_path / "m.csv").write_text(text)
     with pytest.raises(ConfigError, match=told) as error:
-        read_matrix(tmp_path / "m.csv")
+        spaces.read_matrix(tmp_path / "m.csv")
     assert "m.csv" in str(error.value) and "\n" not in str(error.value)
 
 
 def test_what_is_no_frame_is_refused():
     with pytest.raises(ConfigError, match="faceverse58, deca56"):
-        decode(np.zeros((1, 58)), "emoca")
+        spaces.decode(np.zeros((1, 58)), "emoca")
     with pytest.raises(ValueError, match=r"not \(N, 56\)"):
-        decode(np.zeros((1, 58)), "deca56")
+        spaces.decode(np.zeros((1, 58)), "deca56")
     with pytest.raises(ValueError, match="frame 1 is not finite"):
-        decode(np.array([[0.0] * 56, [np.nan] * 56]), "deca56")
+        spaces.decode(np.array([[0.0] * 56, [np.nan] * 56]), "deca56")
 
 
 @pytest.mark.parametrize(
@@ -151,18 +135,15 @@ def test_what_is_no_frame_is_refused():
     ],
 )
 def test_a_channel_goes_by_every_spelling(name, channel):
-    assert channel_of(name) == channel
+    assert spaces.channel_of(name) == channel
 
 
-def test_every_shape_has_its_short_name():
+def test_every_shape_has_its_short_name_and_what_is_left_out_is_counted_and_named():
     for name in BLENDSHAPES:
         short = name.replace("Left", "_L").replace("Right", "_R")
-        assert channel_of(f"ARKit.{short}") == channel_of(name.upper()) == name
-
-
-def test_what_is_left_out_is_counted_and_named():
-    assert used_line(["jawOpen", "yaw"], ["b", "a"]) == "1 of 52 channels used; not known: a, b"
-    assert used_line(BLENDSHAPES, []) == "52 of 52 channels used"
+        assert spaces.channel_of(f"ARKit.{short}") == spaces.channel_of(name.upper()) == name
+    assert spaces.used_line(["jawOpen", "yaw"], ["b", "a"]) == "1 of 52 channels used; not known: a, b"
+    assert spaces.used_line(BLENDSHAPES, []) == "52 of 52 channels used"
 
 
 TURN = np.sin(np.arange(90) / 30)
@@ -186,8 +167,8 @@ def face_of(**channels):
     ],
 )
 def test_units_are_decided_by_what_a_head_can_do_in_a_file_and_live(motion, line):
-    times_s, live = np.arange(90) / 30, LiveUnits()
-    units = units_of(motion, times_s)
+    times_s, live = np.arange(90) / 30, spaces.LiveUnits()
+    units = spaces.units_of(motion, times_s)
     assert units.line == line
     taken = [live.take(row, time_s) for row, time_s in zip(motion, times_s, strict=True)]
     assert live.units == units and all(each is None for each in taken[:30])
@@ -197,7 +178,7 @@ def test_units_are_decided_by_what_a_head_can_do_in_a_file_and_live(motion, line
 
 def test_a_face_beyond_a_head_is_named():
     row = np.zeros(58)
-    assert beyond(row) is None
+    assert spaces.beyond(row) is None
     for name, value, line in [
         ("yaw", 20.0, "yaw: expected radians (in degrees?), got 20"),
         ("z", -600.0, "z: expected metres (in cm or mm?), got -600"),
@@ -206,4 +187,4 @@ def test_a_face_beyond_a_head_is_named():
     ]:
         wrong = row.copy()
         wrong[CHANNEL_INDEX[name]] = value
-        assert beyond(wrong) == line
+        assert spaces.beyond(wrong) == line

@@ -40,47 +40,40 @@ def test_every_column_order_and_case_reads_the_same(tmp_path, order, case):
     np.testing.assert_allclose(track.motion[0, 6:], expected, rtol=1e-6)
 
 
-def test_live_link_timecode_counts_sixty_a_second_and_starts_at_zero(tmp_path):
+def test_live_link_timecode_counts_sixty_a_second_from_zero_and_runs_on_across_midnight(tmp_path):
     header = ["Timecode", "BlendShapeCount", "JawOpen", "HeadYaw", "HeadPitch", "HeadRoll"]
     codes = ["12:27:59:56.169", "12:27:59:58.169", "12:28:00:00.168", "12:28:00:02.168"]
     track = read_track(written(tmp_path / "a.csv", header, *([code, 61, 0.5, 0.3, 0.2, 0.1] for code in codes)))
     np.testing.assert_allclose(track.times_s, np.arange(4) / 30, atol=1e-4)
     np.testing.assert_allclose(track.motion[0, :3], [0.1, 0.2, 0.3], rtol=1e-6)  # radians: roll, pitch, yaw
-
-
-def test_timecode_runs_on_across_midnight(tmp_path):
     rows = [["23:59:59:58.0", 0.1], ["00:00:00:00.0", 0.2]]
     track = read_track(written(tmp_path / "a.csv", ["Timecode", "JawOpen"], *rows))
     np.testing.assert_allclose(track.times_s, [0, 1 / 30], atol=1e-9)
 
 
-def test_pose_columns_carry_their_unit_in_the_name(tmp_path):
+def test_pose_columns_carry_their_unit_in_the_name_and_a_cameras_distance_is_taken_off(tmp_path):
     degrees = written(tmp_path / "d.csv", ["t_s", "yaw_deg", "pitch_deg", "x_cm"], [0, 90, -45, 3])
     radians = written(tmp_path / "r.csv", ["t_s", "yaw_rad", "pitch", "x_mm"], [0, math.pi / 2, -math.pi / 4, 30])
     np.testing.assert_allclose(read_track(degrees).motion, read_track(radians).motion, atol=1e-6)
     assert read_track(degrees).motion[0, 3] == pytest.approx(0.03)
-
-
-def test_a_camera_sees_our_forward_as_its_z_and_its_distance_is_taken_off(tmp_path):
     header = ["t_s", "headYaw_deg", "headX_cm", "headY_cm", "headZ_cm"]
     track = read_track(written(tmp_path / "a.csv", header, *([t, 0, t, 10 * t, -40 + 2 * t] for t in range(3))))
     np.testing.assert_allclose(track.motion[2, 3:6], [0.02, 0.01, 0.1], atol=1e-6)
 
 
-def test_a_row_with_empty_cells_is_a_lost_face(tmp_path):
+def test_a_row_with_empty_cells_or_that_counts_no_shapes_is_a_lost_face(tmp_path):
     file = written(tmp_path / "a.csv", ["t_s", "jawOpen", "eyeBlinkLeft"], [0, 0.1, 0.2], [0.1], [0.2, "", 0.1])
     assert np.isnan(read_track(file).motion).all(axis=1).tolist() == [False, True, True]
+    file = written(tmp_path / "a.csv", ["t_s", "BlendshapeCount", "jawOpen"], [0, 61, 0.1], [0.1, 0], [0.2, 61, 0.1])
+    assert np.isnan(read_track(file).motion).all(axis=1).tolist() == [False, True, False]
 
 
-def test_gzip_is_known_by_its_content(tmp_path):
+def test_gzip_is_known_by_its_content_and_a_tracker_that_overshoots_is_clipped(tmp_path):
     file = tmp_path / "track.csv"
     file.write_bytes(gzip.compress(b"\xef\xbb\xbft_s,jawOpen\n0,0.25\n"))
     assert read_track(file).motion[0, JAW] == 0.25
-
-
-def test_a_live_link_row_that_counts_no_shapes_is_a_lost_face(tmp_path):
-    file = written(tmp_path / "a.csv", ["t_s", "BlendshapeCount", "jawOpen"], [0, 61, 0.1], [0.1, 0], [0.2, 61, 0.1])
-    assert np.isnan(read_track(file).motion).all(axis=1).tolist() == [False, True, False]
+    track = read_track(written(tmp_path / "a.csv", FACE, [0, 1.2, -0.1]))
+    assert track.motion[0].max() == 1.0 and track.motion[0].min() == 0.0
 
 
 @pytest.mark.parametrize("name", ["track.csv", "track.csv.gz"])
@@ -105,15 +98,12 @@ def test_resampling_a_straight_line_stays_on_it(from_hz, to_hz):
     assert out.times_s[-1] <= times_s[-1] + 1e-6 < out.times_s[-1] + 1 / to_hz + 1e-5
 
 
-def test_a_blink_of_one_row_survives_resampling():
+def test_a_blink_of_one_row_survives_resampling_and_what_is_not_seen_stays_unknown():
     motion = np.zeros((60, 58), dtype=np.float32)
     motion[31, [BLINK, JAW]] = 1.0
     out = resample(Track(np.arange(60) / 60, motion, frozenset(CHANNELS)), 25)
     assert out.motion[:, BLINK].max() == 1.0
     assert out.motion[:, JAW].max() < 1.0
-
-
-def test_what_is_not_seen_stays_unknown_after_resampling():
     motion = np.zeros((6, 58), dtype=np.float32)
     motion[1] = np.nan
     track = Track(np.array([0.1, 0.2, 0.3, 0.4, 0.9, 1.0]), motion, frozenset(CHANNELS))
@@ -179,14 +169,14 @@ def test_cells_may_be_divided_by_semicolons_or_tabs_and_decimals_by_a_comma(tmp_
     assert track.motion[0, CHANNEL_INDEX["yaw"]] == pytest.approx(math.radians(-9)) and np.isnan(track.motion[1]).all()
 
 
-def test_a_last_row_that_is_cut_off_is_left_out_and_said(tmp_path, caplog):
+def test_a_last_row_that_is_cut_off_and_a_doubled_row_are_left_out_and_said(tmp_path, caplog):
     track = read_track(written(tmp_path / "a.csv", FACE, [0, 0.1, 0.2], [0.04, 0.3, 0.2], [0.08, 0.3]))
     assert len(track.times_s) == 2 and "last row is cut off" in caplog.text
-
-
-def test_a_tracker_that_overshoots_is_clipped(tmp_path):
-    track = read_track(written(tmp_path / "a.csv", FACE, [0, 1.2, -0.1]))
-    assert track.motion[0].max() == 1.0 and track.motion[0].min() == 0.0
+    rows = [[n / 25, 0.1, 0.2] for n in (0, 1, 1, 2)]
+    assert len(read_track(written(tmp_path / "a.csv", FACE, *rows)).times_s) == 3
+    assert "rows with the time of the row before are left out: 1" in caplog.text
+    with pytest.raises(ConfigError, match="column t_s: 18 of 20 rows have the time of the row before"):
+        read_track(written(tmp_path / "b.csv", FACE, *([n // 10, 0.1, 0.2] for n in range(20))))
 
 
 LIVE_LINK = ["Timecode", "BlendShapeCount", "JawOpen", "HeadYaw", "HeadPitch", "HeadRoll", "LeftEyeYaw"]
@@ -205,26 +195,20 @@ def test_other_spellings_are_read_and_what_is_left_out_is_counted_and_named(tmp_
     assert warnings(caplog, file) == ["3 of 52 channels used; not known: jawOpne, mood"]
 
 
-def test_all_that_the_live_link_app_writes_is_known(tmp_path, caplog):
+def test_all_that_the_live_link_app_writes_is_known_and_percent_is_read_as_percent(tmp_path, caplog):
     read_track(written(tmp_path / "a.csv", LIVE_LINK, ["10:00:00:00.000", 61, 0.2, 0.1, 0.1, 0.1, 0.1]))
     assert not caplog.records
-
-
-def test_a_head_in_small_degrees_is_read_as_degrees_over_the_whole_file(tmp_path, caplog):
-    yaw = [5.5 * math.sin(n / 3) for n in range(25)]
-    rows = [[f"10:00:00:{2 * n:02d}.000", 61, 0.2, each, 4.0, 0, 0] for n, each in enumerate(yaw)]
-    file = written(tmp_path / "a.csv", LIVE_LINK, *rows)
-    np.testing.assert_allclose(read_track(file).motion[:, 2], np.radians(yaw), atol=1e-6)
-    assert len(caplog.records) == 1 and "angles are taken as degrees" in caplog.text
-
-
-def test_percent_is_read_as_percent(tmp_path, caplog):
     track = read_track(written(tmp_path / "a.csv", FACE, *([n / 25, 40, 0.5] for n in range(5))))
     assert track.motion[0, JAW] == pytest.approx(0.4) and track.motion[0, BLINK] == pytest.approx(0.005)
     assert "blendshapes are taken as percent" in caplog.text
 
 
-def test_declared_units_are_believed_beside_undeclared_ones(tmp_path):
+def test_a_head_in_small_degrees_is_read_as_degrees_and_declared_units_are_believed(tmp_path, caplog):
+    yaw = [5.5 * math.sin(n / 3) for n in range(25)]
+    rows = [[f"10:00:00:{2 * n:02d}.000", 61, 0.2, each, 4.0, 0, 0] for n, each in enumerate(yaw)]
+    file = written(tmp_path / "a.csv", LIVE_LINK, *rows)
+    np.testing.assert_allclose(read_track(file).motion[:, 2], np.radians(yaw), atol=1e-6)
+    assert len(caplog.records) == 1 and "angles are taken as degrees" in caplog.text
     header = ["t_s", "yaw", "pitch_rad", "roll_deg"]
     motion = read_track(written(tmp_path / "a.csv", header, *([n / 25, 20, 0.3, 3] for n in range(9)))).motion
     np.testing.assert_allclose(motion[:, :3], np.tile([math.radians(3), 0.3, math.radians(20)], (9, 1)), rtol=1e-6)
@@ -243,14 +227,6 @@ def test_drop_frame_timecode_runs_on_over_a_minute_at_29_97(tmp_path, counts):
     rows = [[f"00:{second // 60:02d}:{second % 60:02d};{n:02d}", 0.5] for second, n in labels]
     times_s = read_track(written(tmp_path / "a.csv", ["Timecode", "JawOpen"], *rows)).times_s
     np.testing.assert_allclose(np.diff(times_s), 1.001 / counts, rtol=1e-6)
-
-
-def test_a_doubled_row_is_left_out_and_many_are_refused(tmp_path, caplog):
-    rows = [[n / 25, 0.1, 0.2] for n in (0, 1, 1, 2)]
-    assert len(read_track(written(tmp_path / "a.csv", FACE, *rows)).times_s) == 3
-    assert "rows with the time of the row before are left out: 1" in caplog.text
-    with pytest.raises(ConfigError, match="column t_s: 18 of 20 rows have the time of the row before"):
-        read_track(written(tmp_path / "b.csv", FACE, *([n // 10, 0.1, 0.2] for n in range(20))))
 
 
 @pytest.mark.parametrize(

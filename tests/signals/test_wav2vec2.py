@@ -58,16 +58,10 @@ def test_a_hop_of_frames_streams_as_it_is_offline(folder, hop):
         hopping.of_recording(NOISE, fps=30)
 
 
-def test_sound_of_2_s_ago_is_forgotten(model):
+def test_rows_forget_2_s_ago_come_at_the_rate_of_the_data_and_do_not_depend_on_loudness(model):
     long = np.concatenate([NOISE, NOISE, NOISE, NOISE])
     np.testing.assert_allclose(model.of_recording(long)[60:75], model.of_recording(long[640 * 9 :])[51:66], atol=1e-5)
-
-
-def test_rows_per_second_are_those_of_the_data(model):
     assert model.of_recording(NOISE, fps=30).shape == (30, 16)
-
-
-def test_loudness_does_not_matter_when_the_model_normalises(model):
     np.testing.assert_allclose(model.of_recording(NOISE)[-1], model.of_recording(0.2 * NOISE)[-1], atol=1e-2)
 
 

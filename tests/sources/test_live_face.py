@@ -14,20 +14,7 @@ from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE, POSE_CHANNELS, SHAPES
 from sfms_robot.signals.rotations import rotation
 from sfms_robot.signals.spaces import angles_of
-from sfms_robot.sources.live_face import (
-    AWAY_S,
-    LOST_S,
-    PACKETS_PER_CALL,
-    SILENT_S,
-    UNHEARD_S,
-    Datagram,
-    Decoder,
-    LiveFace,
-    RestingFace,
-    UdpSight,
-    parse_endpoint,
-    parse_face_argument,
-)
+from sfms_robot.sources import live_face as live
 from sfms_robot.sources.registry import split_kind
 
 SMILE, JAW = CHANNEL_INDEX["mouthSmileLeft"], CHANNEL_INDEX["jawOpen"]
@@ -36,8 +23,6 @@ FIRST, SECOND = ("192.0.2.1", 1), ("192.0.2.2", 2)
 
 
 # --- the flag -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("face", "kind", "place", "flips"),
     [
@@ -51,7 +36,7 @@ FIRST, SECOND = ("192.0.2.1", 1), ("192.0.2.2", 2)
 )
 def test_a_flag_is_a_kind_a_place_and_flips(face, kind, place, flips):
     given_kind, argument = split_kind(face)
-    given_place, signs = parse_face_argument(kind, argument)
+    given_place, signs = live.parse_face_argument(kind, argument)
     assert (given_kind, given_place) == (kind, place)
     assert signs.tolist() == [-1 if name in flips else 1 for name in POSE_CHANNELS]
 
@@ -66,7 +51,7 @@ def test_a_flag_is_a_kind_a_place_and_flips(face, kind, place, flips):
 )
 def test_an_option_that_cannot_be_used_is_one_line_with_choices(argument, text):
     with pytest.raises(ConfigError, match=text):
-        parse_face_argument("live-link", argument)
+        live.parse_face_argument("live-link", argument)
 
 
 @pytest.mark.parametrize(
@@ -81,18 +66,16 @@ def test_an_option_that_cannot_be_used_is_one_line_with_choices(argument, text):
     ],
 )
 def test_a_place_without_a_host_is_this_machine_alone(place, expected):
-    assert parse_endpoint("vmc", place) == expected
+    assert live.parse_endpoint("vmc", place) == expected
 
 
 @pytest.mark.parametrize("place", ["x", "0", "65536", "-1", ":1234", "host:", "host", "1.5", "²"])
 def test_a_port_that_is_none_is_one_line(place):
     with pytest.raises(ConfigError, match="expected a UDP port .valid: live-link, live-link:PORT, live-link:HOST:PORT"):
-        parse_endpoint("live-link", place)
+        live.parse_endpoint("live-link", place)
 
 
 # --- the person's rest --------------------------------------------------------------------------------------------
-
-
 def motion(pose=(0, 0, 0), **shapes):
     out = np.zeros(MOTION_DIM, np.float32)
     out[:3] = pose
@@ -103,7 +86,7 @@ def motion(pose=(0, 0, 0), **shapes):
 
 def follow(faces, start_s=0.0, state=None):
     """Return what comes of faces at `HZ`, and the memory."""
-    state = state or RestingFace()
+    state = state or live.RestingFace()
     return np.array([state.relative(face, start_s + i / HZ) for i, face in enumerate(faces)]), state
 
 
@@ -160,7 +143,7 @@ def test_pose_and_place_are_seen_from_the_resting_ones():
     assert out[:6] == pytest.approx([*turn, 0.1, 0, 0], abs=1e-5)
 
 
-@pytest.mark.parametrize(("away_s", "yaw"), [(AWAY_S, 0.0), (AWAY_S / 2, 0.5)])
+@pytest.mark.parametrize(("away_s", "yaw"), [(live.AWAY_S, 0.0), (live.AWAY_S / 2, 0.5)])
 def test_a_face_that_comes_back_is_known_unless_it_was_away_for_10_s(away_s, yaw):
     _, state = follow([motion((0, 0, 0))] * 60 * HZ)
     out, state = follow([motion((0, 0, 0.5))] * 10, 60 + away_s, state)
@@ -170,7 +153,7 @@ def test_a_face_that_comes_back_is_known_unless_it_was_away_for_10_s(away_s, yaw
 
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(0, 1), st.floats(0, 30)), min_size=1, max_size=40))
 def test_the_result_is_a_face(faces):
-    state, time_s = RestingFace(), 0.0
+    state, time_s = live.RestingFace(), 0.0
     for angle, value, pause_s in faces:
         time_s += pause_s
         given_face = np.full(MOTION_DIM, value, np.float32)
@@ -181,7 +164,7 @@ def test_the_result_is_a_face(faces):
 
 
 def test_the_strongest_blink_since_the_last_question_is_seen():
-    face = LiveFace()
+    face = live.LiveFace()
     for i, blink in enumerate((0.0, 0.0, 1.0, 0.2)):
         face.put(i / 60, motion(eyeBlinkLeft=blink))
         if i == 0:
@@ -191,9 +174,7 @@ def test_the_strongest_blink_since_the_last_question_is_seen():
 
 
 # --- packets ------------------------------------------------------------------------------------------------------
-
-
-class Bytes(Decoder):
+class Bytes(live.Decoder):
     """A protocol of one byte: the first pose channel in percent; 255 is none of it."""
 
     def __init__(self):
@@ -209,7 +190,7 @@ class Bytes(Decoder):
 
 
 def opened(place=None, decoder=None):
-    return UdpSight("vmc", str(place or free_udp_port()), decoder or Bytes(), lambda *_: "call 42")
+    return live.UdpSight("vmc", str(place or free_udp_port()), decoder or Bytes(), lambda *_: "call 42")
 
 
 @pytest.fixture
@@ -222,7 +203,7 @@ def sight(caplog):
 
 def feed(sight, sender, *times_s, data=b"\x0a"):
     for time_s in times_s:
-        sight.feed(Datagram(data, sender, time_s))
+        sight.feed(live.Datagram(data, sender, time_s))
 
 
 def counts(sight):
@@ -231,12 +212,12 @@ def counts(sight):
 
 def test_a_second_sender_is_refused_once_in_the_log_until_the_first_is_silent(sight, caplog):
     feed(sight, FIRST, 0.0)
-    feed(sight, SECOND, 0.1, 0.2, SILENT_S - 0.01)
+    feed(sight, SECOND, 0.1, 0.2, live.SILENT_S - 0.01)
     assert counts(sight) == {"faces": 1, "refused": 3, "malformed": 0}
     (said,) = [record.message for record in caplog.records if record.levelno == logging.WARNING]
     assert "192.0.2.2:2 sends too and is refused until 192.0.2.1:1 is silent" in said
-    feed(sight, SECOND, SILENT_S)
-    feed(sight, FIRST, SILENT_S + 0.1)
+    feed(sight, SECOND, live.SILENT_S)
+    feed(sight, FIRST, live.SILENT_S + 0.1)
     assert counts(sight) == {"faces": 2, "refused": 4, "malformed": 0}
     assert sight.statistics()["sender"] == "192.0.2.2:2"
 
@@ -268,9 +249,9 @@ def test_noise_takes_no_senders_place_and_its_reason_is_logged_once(sight, caplo
 
 
 def test_without_packets_the_log_says_once_what_to_do_and_no_sender_is_lost(sight, caplog):
-    sight.at(UNHEARD_S)
+    sight.at(live.UNHEARD_S)
     assert not caplog.records
-    sight.at(UNHEARD_S + 1)
+    sight.at(live.UNHEARD_S + 1)
     sight.at(1e6)
     assert [record.message for record in caplog.records] == ["vmc: no packets yet: call 42"]
     assert not sight.lost
@@ -282,8 +263,8 @@ def test_a_silent_sender_is_lost_after_half_a_second_until_it_is_back(sight):
     for frame in range(25, 51):
         sight.at(frame * 0.04)
         lost.append(sight.lost)
-    assert lost == [frame * 0.04 - 1.0 > LOST_S for frame in range(25, 51)]
-    assert 0.5 <= LOST_S <= 0.6
+    assert lost == [frame * 0.04 - 1.0 > live.LOST_S for frame in range(25, 51)]
+    assert 0.5 <= live.LOST_S <= 0.6
     feed(sight, FIRST, 2.05)
     sight.at(2.08)
     assert not sight.lost
@@ -318,13 +299,13 @@ def test_times_go_forward_whatever_the_wall_clock_does(sight):
 
 def test_a_flood_is_read_in_parts_and_the_newest_faces_are_kept(sight):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        for _ in range(2 * PACKETS_PER_CALL):
+        for _ in range(2 * live.PACKETS_PER_CALL):
             out.sendto(b"\x01", sight.address)
     counts = [0]
-    while counts[-1] < 2 * PACKETS_PER_CALL:
+    while counts[-1] < 2 * live.PACKETS_PER_CALL:
         sight.at(0.0)
         counts.append(sight.statistics()["packets"])
-    assert all(0 < after - before <= PACKETS_PER_CALL for before, after in zip(counts, counts[1:], strict=False))
+    assert all(0 < after - before <= live.PACKETS_PER_CALL for before, after in zip(counts, counts[1:], strict=False))
     sender, first_s = sight._sender, sight._heard_s + 1.0
     feed(sight, sender, *(first_s + np.arange(1000) * 0.02))
     assert sight.at(first_s + (999 - 256) * 0.02) is None

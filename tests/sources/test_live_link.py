@@ -40,8 +40,6 @@ def packet(number=100, values=(0.25,) * 61, version=6, device=b"id", subject=b"p
 
 
 # --- one packet -------------------------------------------------------------------------------------------------
-
-
 def test_every_recorded_packet_says_what_another_program_read_in_it_and_is_motion_by_name():
     rows = decoded()
     assert len(rows) == len(PACKETS) == 180
@@ -57,9 +55,13 @@ def test_every_recorded_packet_says_what_another_program_read_in_it_and_is_motio
         assert motion[:6] == pytest.approx([*angles, 0.0, 0.0, 0.0], abs=1e-6)  # radians, as they are
 
 
-def test_the_head_of_a_packet_of_an_iphone():
+def test_the_head_of_a_packet_of_an_iphone_and_what_is_not_used_of_a_sender_are_told():
     parsed = parse_packet(REAL_HEAD + bytes(61 * 4))
     assert (parsed.subject, parsed.number, parsed.rate_hz) == ("iPhone", 0x0A3FD9, 60)
+    decoder = LiveLinkDecoder()
+    for count, said in ((52, "52 values, not 61: no head angles"), (68, "68 values, not 61: the first 55 are used")):
+        decoder.decode(packet(count, (0.0,) * count), count)
+        assert decoder.remark() == said
 
 
 @pytest.mark.parametrize(
@@ -139,8 +141,6 @@ def test_any_bytes_are_refused_or_finite(data):
 
 
 # --- their order ------------------------------------------------------------------------------------------------
-
-
 def decode(numbers, decoder=None, start_s=0.0, step_s=1 / 60):
     """Which of these frame numbers become faces, and what is counted."""
     decoder = decoder or LiveLinkDecoder()
@@ -191,16 +191,7 @@ def test_a_program_that_does_not_count_is_seen_and_a_packet_without_a_face_shows
     assert (counted["doubled"], counted["lost"], counted["no_face"]) == (0, 0, 1)
 
 
-def test_what_is_not_used_of_a_sender_is_named():
-    decoder = LiveLinkDecoder()
-    for count, said in ((52, "52 values, not 61: no head angles"), (68, "68 values, not 61: the first 55 are used")):
-        decoder.decode(packet(count, (0.0,) * count), count)
-        assert decoder.remark() == said
-
-
 # --- over a socket ----------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def sight():
     opened = open_live_link("127.0.0.1:" + str(free_udp_port()))

@@ -6,14 +6,7 @@ import pytest
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
 from sfms_robot.sources.live_voice import LiveVoice
-from sfms_robot.sources.microphone import (
-    LINES,
-    LONGEST_WAIT_S,
-    REFERENCE_WAIT_S,
-    FrontEnd,
-    Microphone,
-    SpeechFrames,
-)
+from sfms_robot.sources.microphone import LINES, LONGEST_WAIT_S, REFERENCE_WAIT_S, FrontEnd, Microphone, SpeechFrames
 
 ORIGIN_S = 1000.0
 PIECE_S = 0.01

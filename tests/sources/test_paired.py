@@ -13,7 +13,6 @@ from sfms_robot.sources.live_voice import SourcePart
 from sfms_robot.sources.paired import ALLOWANCE_S, FACE_S, LONGEST_WAIT_S, FrameJudge, JudgedSource, PairedSource
 
 # --- what is handed over ---
-
 anything = st.floats(width=32) | st.just(float("nan"))
 samples = hnp.arrays(np.float32, st.sampled_from([0, 1, 639, FRAME_SAMPLES, 641, (2, 640)]), elements=anything)
 vectors = st.sampled_from([0, 3, 6, 52]).flatmap(lambda n: hnp.arrays(np.float32, n, elements=anything))
@@ -95,8 +94,6 @@ def test_an_object_that_is_no_source_is_told_what_it_lacks():
 
 
 # --- the grid ---
-
-
 class Scripted(SourcePart):
     """A voice whose frame i is at hand `late_s[i]` after its end, and a sight whose faces come at `seen_s`."""
 
@@ -178,13 +175,10 @@ def test_the_face_is_the_newest_at_the_end_of_its_frame_and_none_when_it_is_old(
     assert source.statistics()["faces_lost"] == sum(frame.face is None for frame in frames)
 
 
-def test_the_age_of_faces_and_the_latency_of_the_voice_are_measured():
+def test_all_parts_start_and_close_together_and_their_age_and_latency_are_measured():
     source, _, _ = played(Scripted([0.02] * 99, latency_s=0.03), Scripted(seen_s=np.arange(0.03, 2.0, 0.04)))
     assert source.statistics()["face_age_ms"] == {"p50": pytest.approx(10.0), "p99": pytest.approx(10.0)}
     assert source.latency_s == 0.03 and source.statistics()["wait_ms"]["p50"] <= 20.0
-
-
-def test_all_parts_start_and_close_together():
     parts = [Scripted(), Scripted(), Scripted()]
     source = PairedSource(*parts)
     source.start(17.0)

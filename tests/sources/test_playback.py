@@ -25,8 +25,6 @@ TONE_HZ = 40.0  # of which an instant can be told to a few milliseconds
 
 
 # --- the device --------------------------------------------------------------------------------------------------
-
-
 def tone(samples):
     return np.sin(2 * np.pi * TONE_HZ / AUDIO_HZ * np.asarray(samples)).astype(np.float32)
 
@@ -106,13 +104,24 @@ def test_stamps_that_come_late_change_little(seed, latency_s):
     assert device.playout.statistics()["jumps"] == 0
 
 
-def test_what_was_due_before_a_late_start_is_silence():
+def test_what_is_due_before_a_late_start_or_told_too_late_or_before_the_loop_begins_is_silence():
     device = VirtualDevice(48_000, begins_s=0.7, latency_s=0.1)
     device.playout.start(ORIGIN_S)
     device.play(3.0)
     (silence,) = device.playout.silences
     assert silence.first == 0 and silence.last == pytest.approx(0.8 * AUDIO_HZ, abs=2)
     assert device.off_s(after_s=0.0) < 0.001
+    device = VirtualDevice(16_000, latency_s=0.06)
+    device.playout.start(ORIGIN_S)
+    device.play(1.0, ahead_s=FRAME_S)  # of a frame of 40 ms the device wants the end 60 ms before it leaves
+    silent = sum(each.last - each.first for each in device.playout.silences)
+    assert silent > 0.5 * AUDIO_HZ
+    playout = Playout(16_000)
+    playout.tell(0, np.ones(FRAME_SAMPLES, np.float32))
+    assert not playout.block(160, 5.0).any()
+    playout.start(6.0)
+    assert not playout.block(160, 5.01).any()
+    assert not playout.silences
 
 
 @given(for_s=st.floats(0.005, 2.0), says_so=st.booleans())
@@ -131,14 +140,6 @@ def test_a_device_that_ran_dry_was_silent_and_is_on_time_again(for_s, says_so):
     assert (silence.last - silence.first) / AUDIO_HZ == pytest.approx(for_s, abs=0.001)
     assert device.off_s(after_s=0.0) < 0.001
     assert device.playout.statistics()["underruns"] == 1
-
-
-def test_what_is_told_too_late_is_silence():
-    device = VirtualDevice(16_000, latency_s=0.06)
-    device.playout.start(ORIGIN_S)
-    device.play(1.0, ahead_s=FRAME_S)  # of a frame of 40 ms the device wants the end 60 ms before it leaves
-    silent = sum(each.last - each.first for each in device.playout.silences)
-    assert silent > 0.5 * AUDIO_HZ
 
 
 def test_a_stream_that_is_far_off_jumps_to_its_place():
@@ -165,18 +166,7 @@ def test_in_silence_it_is_put_right_at_once():
     assert not device.playout.silences and device.playout.statistics()["jumps"] == 0
 
 
-def test_before_the_loop_begins_it_plays_nothing():
-    playout = Playout(16_000)
-    playout.tell(0, np.ones(FRAME_SAMPLES, np.float32))
-    assert not playout.block(160, 5.0).any()
-    playout.start(6.0)
-    assert not playout.block(160, 5.01).any()
-    assert not playout.silences
-
-
 # --- the voice ---------------------------------------------------------------------------------------------------
-
-
 class VirtualLoudspeaker:
     """`playback.Loudspeaker` on a sound card of 16 kHz, in virtual time.
 

@@ -54,16 +54,13 @@ def test_a_face_belongs_to_the_end_of_its_frame_and_ends_with_its_track():
         assert frame.face.pose[0] == pytest.approx(frame.time_s, abs=1e-6)
 
 
-def test_a_short_voice_starts_again_after_a_second_of_silence():
+def test_a_short_voice_starts_again_after_a_second_of_silence_and_without_loop_never():
     frames = recorded(voice(10), face(0.4), duration_s=2.0, agent_audio=voice(5)).read(9.0)
     heard = [float(frame.audio[0]) for frame in frames]
     assert len(frames) == 50
     assert heard[10:35] == [0.0] * 25 and heard[35:45] == heard[:10]
     assert frames[20].face is None and frames[35].face.pose[0] == frames[0].face.pose[0]
     assert not any(frame.agent_audio.any() for frame in frames[5:])  # the robot's own voice does not
-
-
-def test_without_loop_silence_follows_and_fills_the_last_frame():
     frames = recorded(voice(1)[:100], None, duration_s=2.0, loop=False).read(2.0)
     assert frames[0].audio[:100].all() and not frames[0].audio[100:].any()
     assert not any(frame.audio.any() for frame in frames[1:])

@@ -81,14 +81,11 @@ def test_a_run_lasts_as_long_as_its_recording(audio, face, agent_audio, duration
         assert source.duration_s == (duration_s and pytest.approx(duration_s))
 
 
-def test_a_whole_source_brings_its_own_face():
+def test_what_is_no_voice_or_no_face_or_brings_its_own_is_refused():
     inner = Own()
     with pytest.raises(ConfigError, match="--face push: --audio ear brings its own"):
         open_source("ear", "push", others=kinds(ear=lambda argument: inner))
     assert inner.closed
-
-
-def test_a_face_is_no_voice_and_a_voice_no_face():
     theirs = kinds(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
     with pytest.raises(ConfigError, match="--audio eye: theirs:eye gave a PushedSight, no voice or source"):
         open_source("eye", others=theirs)

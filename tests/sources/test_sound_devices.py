@@ -13,14 +13,7 @@ from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.frames import FRAME_SAMPLES
 from sfms_robot.sources.live_voice import LiveVoice
 from sfms_robot.sources.playback import PlaybackStream, leaves_after_s
-from sfms_robot.sources.sound_devices import (
-    Capture,
-    SoundDevice,
-    captured_s,
-    choose_device,
-    portaudio,
-    why_not_opened,
-)
+from sfms_robot.sources.sound_devices import Capture, SoundDevice, captured_s, choose_device, portaudio, why_not_opened
 
 FLAG = "--audio mic"
 BUILT_IN = SoundDevice(name="HDA Intel PCH: ALC257 Analog (hw:0,0)", number=0, channels=2, rate_hz=44_100.0)
@@ -90,8 +83,6 @@ def test_without_portaudio_its_package_is_named(monkeypatch):
 
 
 # --- blocks ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("first_age_s", "expected_s"),
     [

@@ -57,8 +57,6 @@ def shown(*messages, decoder=None):
 
 
 # --- names ------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "written", [str, str.upper, str.lower, lambda name: "BlendShape." + name.replace("Left", "_L")]
 )
@@ -87,26 +85,21 @@ def test_a_preset_moves_the_shapes_nearest_to_it(preset, moves):
     assert {name for name in BLENDSHAPES if motion[CHANNEL_INDEX[name]]} == moves
 
 
-def test_presets_count_until_an_arkit_shape_moves():
+def test_presets_count_until_an_arkit_shape_moves_and_with_apply_bundles_of_one_face_are_one():
     decoder = VmcDecoder()
     motion = shown(*(blend(name, 0.0) for name in BLENDSHAPES), blend("Joy", 1.0), APPLY, decoder=decoder)
     assert motion[CHANNEL_INDEX["mouthSmileRight"]] == 1
     motion = shown(blend("mouthSmileLeft", 0.2), APPLY, decoder=decoder)
     assert motion[CHANNEL_INDEX["mouthSmileLeft"]] == pytest.approx(0.2)
     assert motion[CHANNEL_INDEX["mouthSmileRight"]] == 0
-
-
-def test_names_that_say_nothing_are_counted():
     decoder = VmcDecoder()
-    assert shown(blend("Ahoge", 1.0), blend("Ahoge", 0.5), blend("Tail", 1.0), APPLY, decoder=decoder) is None
-    assert decoder.statistics()["unknown_names"] == 2
-    assert shown(blend("Joy", 1.0), APPLY, decoder=decoder) is not None
-    assert decoder.remark() == "4 of 52 channels used; not known: Ahoge, Tail"
+    shown(blend("jawOpen", 0.5), APPLY, decoder=decoder)
+    assert shown(blend("jawOpen", 0.75), decoder=decoder) is None
+    assert shown(blend("eyeBlinkLeft", 0.75), decoder=decoder) is None
+    assert shown(APPLY, decoder=decoder)[CHANNEL_INDEX["jawOpen"]] == 0.75
 
 
 # --- faces that nothing completes -------------------------------------------------------------------------------
-
-
 def faces_of(rounds, pack, decoder=None):
     """The jaw of each face that comes out of rounds of blendshapes a 30th of a second apart, and what is due then."""
     decoder, jaws = decoder or VmcDecoder(), []
@@ -123,25 +116,20 @@ def test_without_apply_a_face_is_complete_when_the_next_begins_or_after_100_ms(p
     assert faces_of([0.25, 0.5, 0.75], pack) == [(0.25, 0.75), (0.5, 0.5), (0.75, 0.25)]
 
 
-def test_with_apply_bundles_of_one_face_are_one_face():
-    decoder = VmcDecoder()
-    shown(blend("jawOpen", 0.5), APPLY, decoder=decoder)
-    assert shown(blend("jawOpen", 0.75), decoder=decoder) is None
-    assert shown(blend("eyeBlinkLeft", 0.75), decoder=decoder) is None
-    assert shown(APPLY, decoder=decoder)[CHANNEL_INDEX["jawOpen"]] == 0.75
-
-
-def test_a_sender_without_blendshapes_is_told_what_to_switch_on():
+def test_what_a_sender_lacks_and_names_that_say_nothing_are_told():
     decoder = VmcDecoder()
     shown(message("/VMC/Ext/OK", 1), decoder=decoder)
     assert decoder.remark().startswith("neither blendshapes (/VMC/Ext/Blend/Val) nor the bone Head")
     shown(bone("Head", IDENTITY), decoder=decoder)
     assert decoder.remark().startswith("the head's pose and no blendshapes")
+    decoder = VmcDecoder()
+    assert shown(blend("Ahoge", 1.0), blend("Ahoge", 0.5), blend("Tail", 1.0), APPLY, decoder=decoder) is None
+    assert decoder.statistics()["unknown_names"] == 2
+    assert shown(blend("Joy", 1.0), APPLY, decoder=decoder) is not None
+    assert decoder.remark() == "4 of 52 channels used; not known: Ahoge, Tail"
 
 
 # --- bones ------------------------------------------------------------------------------------------------------
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_any_rotation_turns_our_axes_as_it_turns_unitys(seed):
     """R_ours = A R A^T, A a reflection: it takes left-handed axes to right-handed ones."""
@@ -166,8 +154,6 @@ def test_lost_tracking_shows_nothing_until_it_is_back():
 
 
 # --- other types, and what is none ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("value", [1, (0.25, "d"), (1, "h")])
 def test_numbers_of_other_types_are_read(value):
     turn = [(part, "d") for part in (*LEVEL, 0.0, math.sin(0.15), 0.0, math.cos(0.15))]
@@ -257,8 +243,6 @@ def test_any_bytes_are_refused_or_finite(data):
 
 
 # --- over a socket ----------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def sight():
     opened = open_vmc(str(free_udp_port()))

@@ -15,36 +15,20 @@ from sfms_robot.face.drawing import VirtualWebcam
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS
 from sfms_robot.lab.bench.webcam_bench import face_of, webcam, write_video
 from sfms_robot.signals.rotations import rotation
-from sfms_robot.sources.webcam import (
-    GONE_S,
-    NEARER,
-    TAKE_OVER_S,
-    Landmarker,
-    SeenFace,
-    SeenPicture,
-    Webcam,
-    WebcamOpened,
-    choose,
-    live,
-    open_video,
-    open_webcam,
-    played,
-    seen_face,
-    watch,
-)
+from sfms_robot.sources import webcam as camera_source
 from sfms_robot.sources.worker import SourceWorker
 
 pytestmark = pytest.mark.realtime
 
 ORIGIN_S = 1000.0
 PLACE_M = np.array([0.6, 0.0, 0.0], np.float32)
-FACE = SeenFace(face_of(pitch=0.1), PLACE_M)
+FACE = camera_source.SeenFace(face_of(pitch=0.1), PLACE_M)
 
 
 def seen(time_s, face=FACE, others=0, dark=False):
     """A picture of loop time `time_s`, known 20 ms later."""
     taken_s = ORIGIN_S + time_s
-    return SeenPicture(taken_s=taken_s, known_s=taken_s + 0.02, face=face, others=others, dark=dark)
+    return camera_source.SeenPicture(taken_s=taken_s, known_s=taken_s + 0.02, face=face, others=others, dark=dark)
 
 
 @pytest.fixture
@@ -57,7 +41,7 @@ def camera():
         opened.append(worker)
         for _ in messages:
             worker.wait()
-        return Webcam(worker, None, None)
+        return camera_source.Webcam(worker, None, None)
 
     yield of
     for worker in opened:
@@ -97,14 +81,14 @@ def test_what_was_not_seen_is_counted(camera):
 )
 def test_what_cannot_be_opened_is_one_line(argument, error, text):
     with pytest.raises(error, match=text) as raised:
-        open_webcam(argument)
+        camera_source.open_webcam(argument)
     assert "\n" not in str(raised.value)
 
 
 def test_without_the_extra_the_install_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "mediapipe", None)
     with pytest.raises(MissingExtra, match=r"--face webcam needs .*pip install -e '.*\[webcam\]'"):
-        next(watch("0"))
+        next(camera_source.watch("0"))
 
 
 @pytest.fixture
@@ -114,23 +98,20 @@ def grey_video(tmp_path):
     return str(file)
 
 
-def test_a_camera_that_gives_no_more_pictures_went_away(grey_video):
-    pictures = live(open_video(grey_video), "3")
+def test_a_camera_that_gives_no_more_pictures_went_away_and_a_video_waits_for_its_time(grey_video):
+    pictures = camera_source.live(camera_source.open_video(grey_video), "3")
     means = [next(pictures)[1].mean() for _ in range(5)]
     assert means == sorted(means)
     with pytest.raises(PortError, match="camera 3 went away"):
         next(pictures)
-
-
-def test_a_video_waits_for_its_time_and_leaves_out_what_is_late(grey_video):
-    due_s, nothing_yet = next(played(open_video(grey_video), time.monotonic() + 60.0))
+    due_s, nothing_yet = next(camera_source.played(camera_source.open_video(grey_video), time.monotonic() + 60.0))
     assert nothing_yet is None and due_s > time.monotonic()
-    assert list(played(open_video(grey_video), time.monotonic() - 60.0)) == []
+    assert list(camera_source.played(camera_source.open_video(grey_video), time.monotonic() - 60.0)) == []
 
 
 def test_a_worker_says_what_it_opened_and_waits_to_be_told_when_to_begin(grey_video):
-    work = watch(grey_video)
-    assert next(work) == WebcamOpened(0.5)
+    work = camera_source.watch(grey_video)
+    assert next(work) == camera_source.WebcamOpened(0.5)
     assert work.send(None) is None
     first = work.send(time.monotonic())
     while first is None:
@@ -140,14 +121,12 @@ def test_a_worker_says_what_it_opened_and_waits_to_be_told_when_to_begin(grey_vi
 
 
 def test_a_covered_lens_shows_no_face():
-    landmarker = Landmarker()
+    landmarker = camera_source.Landmarker()
     assert landmarker.faces(np.zeros((480, 640, 3), np.uint8), 0.0) == []
     landmarker.close()
 
 
 # --- a face in our axes -----------------------------------------------------------------------------------------
-
-
 def matrix_of(roll, pitch, yaw, right_up_near_cm=(0.0, 0.0, -60.0)):
     """Face -> camera as MediaPipe gives it: our rotation, with x = left, y = up, z = forward."""
     theirs, matrix = [1, 2, 0], np.eye(4)  # their axes, among ours
@@ -158,7 +137,7 @@ def matrix_of(roll, pitch, yaw, right_up_near_cm=(0.0, 0.0, -60.0)):
 
 @given(st.tuples(st.floats(-3.0, 3.0), st.floats(-1.5, 1.5), st.floats(-3.0, 3.0)))
 def test_the_rotation_is_ours_signs_included(turn):
-    pose = seen_face(matrix_of(*turn), {}).motion[:3]
+    pose = camera_source.seen_face(matrix_of(*turn), {}).motion[:3]
     np.testing.assert_allclose(matrix_of(*pose), matrix_of(*turn), atol=1e-5)
 
 
@@ -170,22 +149,20 @@ def test_the_rotation_is_ours_signs_included(turn):
     ],
 )
 def test_the_place_is_the_persons_and_the_eyes_are_seen_from_the_camera(yaw, right_up_near_cm, place, eyes):
-    seen = seen_face(matrix_of(0, 0, yaw, right_up_near_cm), {})
+    seen = camera_source.seen_face(matrix_of(0, 0, yaw, right_up_near_cm), {})
     np.testing.assert_allclose(seen.motion[3:6], place, atol=1e-6)
     np.testing.assert_allclose(seen.place_m, eyes, atol=1e-6)
 
 
 def test_blendshapes_go_by_name_and_the_tongue_is_not_seen():
     told = {name: place / 100 for place, name in enumerate(ORDERS["mediapipe"])}
-    seen = seen_face(matrix_of(0, 0, 0), told)
+    seen = camera_source.seen_face(matrix_of(0, 0, 0), told)
     for name in BLENDSHAPES:
         assert seen.motion[CHANNEL_INDEX[name]] == np.float32(told.get(name, 0.0))
     assert seen.motion[CHANNEL_INDEX["tongueOut"]] == 0.0
 
 
 # --- the person among several faces -----------------------------------------------------------------------------
-
-
 STEP_S = 1 / 30
 LEFT, RIGHT = np.array([0.6, 0.3, 0.0]), np.array([0.6, -0.3, 0.0])
 
@@ -194,7 +171,7 @@ def followed(pictures):
     """The chosen place in every picture (a list of places), None where nobody is."""
     before, out = None, []
     for number, places in enumerate(pictures):
-        index, before = choose(places, number * STEP_S, before)
+        index, before = camera_source.choose(places, number * STEP_S, before)
         out.append(None if index is None else places[index])
     return out
 
@@ -208,34 +185,34 @@ def test_of_two_that_are_equally_near_the_first_chosen_stays(sways):
     assert all(place[1] > 0 for place in followed(pictures))
 
 
-def test_one_who_is_clearly_nearer_takes_over_after_a_while_and_stays():
-    near = 0.9 * NEARER * RIGHT
+def test_a_person_is_left_only_for_one_clearly_nearer_or_once_gone_and_followed_as_it_walks():
+    near = 0.9 * camera_source.NEARER * RIGHT
     chosen = followed([[LEFT]] * 10 + [[LEFT, near]] * 90)
     switches = [k for k in range(1, len(chosen)) if chosen[k] is not chosen[k - 1]]
-    assert len(switches) == 1 and (switches[0] - 10) * STEP_S == pytest.approx(TAKE_OVER_S, abs=2 * STEP_S)
+    assert len(switches) == 1 and (switches[0] - 10) * STEP_S == pytest.approx(
+        camera_source.TAKE_OVER_S, abs=2 * STEP_S
+    )
+    chosen = followed([[LEFT]] + [[RIGHT]] * 60)
+    alone = [place is None for place in chosen[1:]]
+    taken = alone.index(False)
+    assert taken * STEP_S == pytest.approx(camera_source.GONE_S, abs=2 * STEP_S) and not any(alone[taken:])
+    walk = [[np.array([0.6, y, 0.0]), np.array([0.9, 0.0, 0.1])] for y in np.linspace(-0.4, 0.4, 60)]
+    assert all(place[0] == 0.6 for place in followed(walk))
 
 
 @pytest.mark.parametrize(
     "moment",
     [
-        ([[LEFT, 0.9 * NEARER * RIGHT]] * round(0.8 * TAKE_OVER_S / STEP_S) + [[LEFT, RIGHT]]) * 5,  # leans in
-        [[RIGHT]] * round(0.8 * GONE_S / STEP_S) + [[RIGHT, LEFT]] * 5,  # the chosen one is hidden
+        (
+            [[LEFT, 0.9 * camera_source.NEARER * RIGHT]] * round(0.8 * camera_source.TAKE_OVER_S / STEP_S)
+            + [[LEFT, RIGHT]]
+        )
+        * 5,  # leans in
+        [[RIGHT]] * round(0.8 * camera_source.GONE_S / STEP_S) + [[RIGHT, LEFT]] * 5,  # the chosen one is hidden
     ],
 )
 def test_a_moment_changes_nothing(moment):
     assert all(place is LEFT or place is None for place in followed([[LEFT, RIGHT]] + moment))
-
-
-def test_another_is_chosen_only_once_the_chosen_one_is_gone():
-    chosen = followed([[LEFT]] + [[RIGHT]] * 60)
-    alone = [place is None for place in chosen[1:]]
-    taken = alone.index(False)
-    assert taken * STEP_S == pytest.approx(GONE_S, abs=2 * STEP_S) and not any(alone[taken:])
-
-
-def test_a_face_is_followed_as_it_walks():
-    walk = [[np.array([0.6, y, 0.0]), np.array([0.9, 0.0, 0.1])] for y in np.linspace(-0.4, 0.4, 60)]
-    assert all(place[0] == 0.6 for place in followed(walk))
 
 
 @given(st.permutations(range(3)))
@@ -245,8 +222,6 @@ def test_the_order_of_the_faces_does_not_matter(order):
 
 
 # --- closed loop: the virtual human before the camera ---------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_channels_come_back_with_their_signs_and_on_their_side():
     turns, moves = ("roll", "pitch", "yaw"), ("x", "y", "z")
@@ -271,7 +246,7 @@ def test_a_recorded_video_is_played_from_the_start_on_in_its_own_process(tmp_pat
     still, nodding = camera.picture(face_of()), camera.picture(face_of(pitch=0.25, jawOpen=0.8))
     file = tmp_path / "nod.avi"
     write_video(file, [still] * 20 + [nodding] * 20, 20)
-    webcam = open_webcam(str(file))
+    webcam = camera_source.open_webcam(str(file))
     try:
         assert webcam.duration_s == pytest.approx(2.0)
         origin_s = time.monotonic()

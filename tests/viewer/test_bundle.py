@@ -24,9 +24,13 @@ def test_the_bundle_is_what_the_sources_give(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
-def test_it_is_small_without_face_tracking():
+def test_it_is_small_without_face_tracking_draws_in_one_place_and_names_no_registry():
     files = [file for file in STATIC.iterdir() if file.is_file() and file.name != "face.js"]
     assert sum(len(gzip.compress(file.read_bytes())) for file in files) < 1_500_000
+    ours = {file.name: file.read_text() for file in STATIC.glob("*.js")}
+    assert [name for name, text in ours.items() if "gl_FragColor = vec4(toScreen" in text] == ["skin.js"]
+    assert all('from"./skin.js"' in ours[name] and 'from"./mesh.js"' in ours[name] for name in ("app.js", "people.js"))
+    assert "resolved" not in (PAGE / "package-lock.json").read_text()
 
 
 @pytest.mark.parametrize("page", ["index.html", "people.html"])
@@ -35,13 +39,3 @@ def test_everything_that_a_page_names_is_there_and_relative(page):
     ours = [name for name in named if not name.startswith(("data:", "#"))]
     assert all(not name.startswith(("/", "http")) for name in ours)
     assert all((STATIC / name.removeprefix("static/")).is_file() for name in ours if name.startswith("static/"))
-
-
-def test_what_both_pages_draw_with_is_bundled_once():
-    ours = {file.name: file.read_text() for file in STATIC.glob("*.js")}
-    assert [name for name, text in ours.items() if "gl_FragColor = vec4(toScreen" in text] == ["skin.js"]
-    assert all('from"./skin.js"' in ours[name] and 'from"./mesh.js"' in ours[name] for name in ("app.js", "people.js"))
-
-
-def test_the_lock_file_names_no_registry():
-    assert "resolved" not in (PAGE / "package-lock.json").read_text()

@@ -28,22 +28,16 @@ def frame(shown=None, **more):
     return json.loads(frame_json(pack_picture(12.34, MOTION, ASKED_RAD, READ_RAD, RARE, **more), shown))
 
 
-def test_a_picture_comes_out_as_it_went_in():
+def test_a_picture_comes_out_as_it_went_in_with_null_for_what_is_not_there():
     told = frame(voice_db=-31.27, own_voice_db=-20.0, attention=0.75, place_m=(1.0, 0.5, -0.25), talking=True)
     assert told["type"] == "frame" and told["t"] == 12.34 and told["talk"] is True
     assert np.allclose(told["m"], MOTION, atol=6e-5) and told["j"] == [0.1, -0.2, 0.3]
     assert told["r"] == [0.11, None, 0.31] and told["u"] == [0.11, -0.2, 0.31]  # never read: shown where it was asked
     assert (told["db"], told["own"], told["at"], told["o"]) == (-31.3, -20.0, 0.75, [1.0, 0.5, -0.25])
     assert (told["s"], told["w"], told["f"], told["h"]) == ("degraded", ["jaw"], {"jaw": "silent"}, {"nod": 0.1235})
-
-
-def test_what_is_not_there_is_null_and_not_nan():
     told = frame()
     assert [told[key] for key in ("db", "own", "at", "o")] == [None, None, None, None] and told["talk"] is False
     assert json.loads(b"{" + rare_json("idle", (), {}, {}) + b"}")["h"] is None
-
-
-def test_a_scene_turns_joints_into_those_of_its_urdf():
     told = frame(lambda angles_rad: 2 * angles_rad[:2])
     assert told["u"] == [0.22, -0.4] and told["j"] == [0.1, -0.2, 0.3]
 

@@ -145,9 +145,11 @@ def test_files_come_compressed_to_a_client_that_takes_it_and_once(page, name, ki
     assert code_of(url, **{"If-None-Match": headers["ETag"]}) == 304
 
 
-def test_a_part_of_a_file_comes_plain(page):
+def test_a_part_of_a_file_comes_plain_and_files_that_are_not_there_are_not_found(page):
     part, _ = got(page.url + "static/chunk.js", **{"Accept-Encoding": "gzip", "Range": "bytes=0-9"})
     assert part == (STATIC / "chunk.js").read_bytes()[:10]
+    for path in ("recording", "robot/robot.urdf", "etc/passwd", "static/../page_server.py"):
+        assert code_of(page.url + path) == 404
 
 
 def test_pictures_go_to_all_and_come_back_in_the_last_run(page):
@@ -290,11 +292,6 @@ def test_half_open_requests_are_ended_in_time_and_others_are_answered_meanwhile(
 def test_pages_of_others_may_not_connect(page, origin):
     with pytest.raises(InvalidStatus, match="403"), visit(page, origin=origin):
         pass
-
-
-def test_files_that_are_not_there_are_not_found(page):
-    for path in ("recording", "robot/robot.urdf", "etc/passwd", "static/../page_server.py"):
-        assert code_of(page.url + path) == 404
 
 
 def test_of_what_a_urdf_names_only_meshes_of_the_heads_folder_are_served(tmp_path):

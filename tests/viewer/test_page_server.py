@@ -30,7 +30,7 @@ def told(visitor):
     return [json.loads(each) if each.startswith("{") else each for each in asyncio.run(all_of_it())]
 
 
-def test_who_does_something_first_has_the_controls_until_they_are_given_back():
+def test_who_does_something_first_has_the_controls_until_given_back_or_not_used():
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
     here.visitors.admit(a, "show")
@@ -44,9 +44,6 @@ def test_who_does_something_first_has_the_controls_until_they_are_given_back():
     assert here.left == [a.number] and here.visitors.controls(b) == "nobody"
     here.visitors.admit(b, "show")
     assert here.visitors.controls(b) == "you"
-
-
-def test_controls_that_are_not_used_go_to_who_asks():
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
     here.visitors.take(a)
@@ -60,12 +57,18 @@ def test_controls_that_are_not_used_go_to_who_asks():
     assert here.visitors.controls(b) == "you" and here.left == [a.number]
 
 
-def test_who_goes_leaves_the_controls():
+def test_there_is_room_for_some_and_who_goes_leaves_the_controls():
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
     here.visitors.take(a)
     here.visitors.leave(a)
     assert here.left == [a.number] and here.visitors.controls(b) == "nobody" and len(here.visitors) == 1
+    here = Here()
+    first = [here.visitors.enter() for _ in range(MOST_VISITORS)][0]
+    with pytest.raises(PacketError, match="look at this head already"):
+        here.visitors.enter()
+    here.visitors.leave(first)
+    assert here.visitors.enter().number == MOST_VISITORS + 1
 
 
 @pytest.mark.parametrize("command", ["halt", "show"])
@@ -87,34 +90,19 @@ def test_a_page_of_another_version_is_to_be_loaded_again():
         here.visitors.greet(here.visitors.enter(), 0, "")
 
 
-def test_there_is_room_for_some_and_not_for_all():
-    here = Here()
-    first = [here.visitors.enter() for _ in range(MOST_VISITORS)][0]
-    with pytest.raises(PacketError, match="look at this head already"):
-        here.visitors.enter()
-    here.visitors.leave(first)
-    assert here.visitors.enter().number == MOST_VISITORS + 1
-
-
-def test_of_pictures_the_newest_is_sent_and_of_messages_all():
+def test_of_pictures_the_newest_is_sent_who_reads_nothing_is_found_out_and_a_flood_is_read_slowly():
     visitor = Here().visitors.enter()
     for picture in ("old", "new"):
         visitor.show(picture)
     visitor.tell(b'{"n":1}')
     visitor.tell(b'{"n":2}')
     assert told(visitor) == [{"n": 1}, {"n": 2}, "new"]
-
-
-def test_who_reads_nothing_is_found_out():
     visitor = Here().visitors.enter()
     for _ in range(OUTBOX):
         visitor.tell(b"{}")
     assert not visitor.behind
     visitor.tell(b"{}")
     assert visitor.behind
-
-
-def test_a_flood_is_read_slowly_and_a_burst_at_once():
     visitor = Here().visitors.enter()
     pauses = [visitor.pause_s(0.01, 100.0) for _ in range(100)]
     assert pauses[:24] == [0.0] * 24 and pauses[-1] == pytest.approx(0.75)

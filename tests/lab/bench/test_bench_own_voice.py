@@ -1,17 +1,10 @@
 """A small version of `bench own-voice`."""
 
-import numpy as np
 import pytest
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.lab.bench.own_voice_bench import (
-    CHOSEN_ON,
-    VoiceCondition,
-    call_names,
-    gear_noise,
-    own_voice,
-)
+from sfms_robot.lab.bench.own_voice_bench import CHOSEN_ON, VoiceCondition, call_names, own_voice
 
 
 def test_calls_that_parameters_were_chosen_on_are_not_reported_on(tmp_path):
@@ -21,13 +14,6 @@ def test_calls_that_parameters_were_chosen_on_are_not_reported_on(tmp_path):
     assert len(call_names(data_dir("sim") / "conversations")) == 2
     with pytest.raises(ConfigError, match="has no NAME_caller"):
         call_names(tmp_path / "nothing")
-
-
-def test_motors_that_stand_are_silent():
-    speed = np.zeros((20, 2))
-    speed[10:, 0] = 1.0
-    noise = gear_noise(speed).reshape(20, 640)
-    assert not noise[:9].any() and (np.abs(noise[11:]).max(axis=1) > 0.01).all()
 
 
 @pytest.mark.slow

@@ -72,16 +72,6 @@ def test_a_page_has_every_row_and_says_where_it_was_measured(tmp_path):
         write_page(tmp_path / "nowhere" / "page.md", rows, 1.0)
 
 
-def test_a_row_says_how_often_against_what_and_on_which_machine():
-    told = BenchResult.of_rows({"one": row([1.0, 2.0, 3.0], [4.0], "ms", "somebody")})
-    found = told.figures["one"]
-    assert (found["median"], found["repeats"], found["ratio"]) == (2.0, 3, 0.5)
-    assert "cores of" in found["machine"]
-    assert told.table[0] | {"p99": None} == {
-        "measured": "one", "median": 2.0, "unit": "ms", "p99": None, "ratio": 0.5, "to": "somebody",
-    }  # fmt: skip
-
-
 def test_a_bench_that_fails_does_not_cost_the_others_their_rows(monkeypatch):
     def fails():
         raise BusError("no servo answers")
@@ -94,27 +84,21 @@ def test_a_bench_that_fails_does_not_cost_the_others_their_rows(monkeypatch):
     assert not told.passed and list(told.lines) == ["first: no servo answers"] and list(told.figures) == ["one"]
 
 
-def test_a_folder_without_the_package_is_refused(tmp_path):
+def test_a_folder_with_the_package_is_found_from_anywhere_and_one_without_it_refused(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"--against .*: no sfms_robot in it"):
         environment(tmp_path)
-
-
-def test_a_folder_with_it_is_found_from_anywhere(tmp_path, monkeypatch):
     (tmp_path / "other" / "sfms_robot").mkdir(parents=True)
     (tmp_path / "other" / "sfms_robot" / "__init__.py").write_text("")
     monkeypatch.chdir(tmp_path)
     assert environment(Path("other"))["PYTHONPATH"] == str(tmp_path / "other")
 
 
-def test_a_layer_costs_two_operations_a_weight_and_row_and_its_gradient_as_many_again():
+def test_a_layer_and_attention_cost_their_operations_and_gradients_as_many_again():
     layer = torch.nn.Linear(10, 20)
     with OperationCount() as count:
         layer(torch.randn(5, 10)).sum().backward()
     assert count.matrix == 2 * 5 * 10 * 20 * 2
     assert count.drawn == 50
-
-
-def test_attention_counts_on_a_processor_too():
     rows = torch.randn(2, 4, 16, 8)
     with OperationCount() as count:
         scaled_dot_product_attention(rows, rows, rows)

@@ -5,15 +5,7 @@ import shutil
 
 from sfms_robot.config import load_listener as load_settings
 from sfms_robot.data import data_dir
-from sfms_robot.lab.bench.listener_bench import (
-    TURN_HOPS,
-    Stream,
-    distance,
-    engine_table,
-    engines_of,
-    take_turns,
-    talk,
-)
+from sfms_robot.lab.bench import listener_bench
 from sfms_robot.lab.bench.measure import listener_process
 from sfms_robot.listeners.registry import load_listener
 
@@ -22,37 +14,37 @@ LISTENERS = data_dir("configs") / "listeners"
 
 def test_a_listener_with_graphs_runs_on_both_engines(tmp_path):
     folder = LISTENERS / "sfms-small"
-    assert engines_of(folder, tmp_path) == {
+    assert listener_bench.engines_of(folder, tmp_path) == {
         "eager": (folder, "torch"), "onnx": (folder, "onnx"),
     }  # fmt: skip
     bare = shutil.copytree(folder, tmp_path / "bare", ignore=shutil.ignore_patterns("onnx"))
-    assert [*engines_of(bare, tmp_path)] == ["eager"]
+    assert [*listener_bench.engines_of(bare, tmp_path)] == ["eager"]
 
 
 def test_another_precision_is_another_folder_with_the_same_weights(tmp_path):
     folder = LISTENERS / "arig-paper"
-    exact, _ = engines_of(folder, tmp_path)["eager"]
+    exact, _ = listener_bench.engines_of(folder, tmp_path)["eager"]
     assert exact != folder and load_settings(exact / "config.yaml").precision == "fp32"
 
 
 def test_hearing_and_planning_are_told_apart_and_a_frame_is_their_mean():
-    streams = {engine: Stream(found, found.start(0)) for engine, found in _both().items()}
-    take_turns(streams, talk(), turns=2)
+    streams = {engine: listener_bench.Stream(found, found.start(0)) for engine, found in _both().items()}
+    listener_bench.take_turns(streams, listener_bench.talk(), turns=2)
     for stream in streams.values():
         hop = stream.listener.hop
-        assert len(stream.frame_ms) == len(stream.planning_ms) == 2 * TURN_HOPS
+        assert len(stream.frame_ms) == len(stream.planning_ms) == 2 * listener_bench.TURN_HOPS
         assert len(stream.hearing_ms) == (hop - 1) * len(stream.planning_ms)
         assert math.isclose(sum(stream.frame_ms) * hop, sum(stream.planning_ms) + sum(stream.hearing_ms))
     figures = streams["onnx"].figures(streams["torch"])
     assert figures["engine"] == "onnx, 1 thread" and figures["peer_median"] > 0
-    (line,) = engine_table({"sfms-small onnx": figures, "sfms-small": figures})
+    (line,) = listener_bench.engine_table({"sfms-small onnx": figures, "sfms-small": figures})
     assert line["measured"] == "sfms-small onnx" and line["planning ms"] == figures["planning_ms"]["p50"]
 
 
 def test_both_engines_do_the_same():
     both = _both()
-    assert 0 < distance(both["onnx"], both["torch"], talk(20)) < 1e-4
-    assert distance(both["onnx"], both["onnx"], talk(20)) == 0
+    assert 0 < listener_bench.distance(both["onnx"], both["torch"], listener_bench.talk(20)) < 1e-4
+    assert listener_bench.distance(both["onnx"], both["onnx"], listener_bench.talk(20)) == 0
 
 
 def test_a_listener_process_says_when_it_plans_and_what_memory_it_takes():

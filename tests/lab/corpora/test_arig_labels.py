@@ -38,23 +38,15 @@ def test_every_state_has_a_pattern_and_every_pattern_a_state():
 
 
 @given(MASKS)
-def test_every_frame_has_one_state_and_its_voices_allow_it(masks):
+def test_every_frame_has_one_state_that_its_voices_allow_and_swapping_who_speaks_swaps_it(masks):
     states = label(Voices(*masks))
     assert states.shape == masks[0].shape
     for state, agent, user in zip(states, masks[0], masks[1], strict=True):
         assert (bool(agent), bool(user)) in PATTERNS[STATES[state]]
-
-
-@given(MASKS)
-def test_swapping_who_speaks_swaps_speaking_and_listening(masks):
     agent, user = masks[0] & ~masks[1], masks[1] & ~masks[0]
     never = np.zeros_like(agent)
     ours, theirs = label(Voices(agent, user, never, never, never)), label(Voices(user, agent, never, never, never))
     assert np.array_equal(ours == STATE["speaking"], theirs == STATE["listening"])
-
-
-@given(MASKS)
-def test_nods_and_feedback_without_a_voice_change_nothing_in_silence(masks):
     silent = np.zeros_like(masks[0])
     assert (label(Voices(silent, silent, *masks[2:])) == STATE["waiting"]).all()
 

@@ -117,32 +117,26 @@ def test_one_seed_composes_the_same_dyads_and_another_one_others(tables, made):
     assert not np.array_equal(other["train"][0].listener[:500], made["train"][0].listener[:500])
 
 
-def test_meetings_are_kept_apart(made):
+def test_dyads_are_as_long_as_asked_for_and_meetings_are_kept_apart(made):
     for split, meeting in MEETINGS.items():
         assert {dyad.name.split("_")[0] for dyad in made[split]} == {meeting}
+    assert sum(len(dyad.listener) for dyad in made["train"]) / FRAME_HZ / 60 == pytest.approx(3, abs=0.8)
+    for dyad in made["train"]:
+        assert 30 * FRAME_HZ <= len(dyad.listener) <= 60 * FRAME_HZ
 
 
-def test_everything_is_used_once_where_enough_is_asked_for(tables):
+def test_everything_is_used_once_where_enough_is_asked_for_and_more_often_where_one_is_spoken_to(tables):
     rng = np.random.default_rng(0)
     found = composed.stretches(ami.read_people(tables), rng)
     assert sorted(composed.choose(found, 1e6, rng), key=id) == sorted(found, key=id)
     total = sum(one.frames for one in found) * FRAME_S / 60
     some = [sum(one.frames for one in composed.choose(found, total / 3, rng)) * FRAME_S / 60 for _ in range(40)]
     assert np.mean(some) == pytest.approx(total / 3, rel=0.1)
-
-
-def test_those_who_are_spoken_to_are_drawn_more_often(tables):
     found = [
         composed.Stretch(person=None, start_s=0.0, end_s=40.0, addressed=share) for share in np.repeat([0.0, 1.0], 100)
     ]
     drawn = composed.choose(found, 40.0, np.random.default_rng(0))
     assert np.mean([one.addressed for one in drawn]) > 0.65
-
-
-def test_dyads_are_as_long_as_asked_for(made):
-    assert sum(len(dyad.listener) for dyad in made["train"]) / FRAME_HZ / 60 == pytest.approx(3, abs=0.8)
-    for dyad in made["train"]:
-        assert 30 * FRAME_HZ <= len(dyad.listener) <= 60 * FRAME_HZ
 
 
 def test_phrases_sound_when_they_were_said(tables, made):
@@ -201,8 +195,6 @@ def test_written_sets_read_back(tables, tmp_path):
 
 
 # --- what the others do -----------------------------------------------------------------------------------------
-
-
 def test_the_speaker_looks_at_the_listener_when_it_was_annotated(made):
     toward, aside = [], []
     for dyad in [dyad for split in SPLITS for dyad in made[split]]:
@@ -217,7 +209,7 @@ def test_the_speaker_looks_at_the_listener_when_it_was_annotated(made):
     assert np.median(near) < 4 and np.median(far) > 12
 
 
-def test_attention_is_what_was_annotated_and_unknown_where_nobody_is_seen(tables, made):
+def test_attention_is_what_was_annotated_and_unknown_where_nobody_is_seen_or_gaze_was_not_annotated(tables, made):
     people = {(person.meeting, person.agent): person for person in ami.read_people(tables)}
     for dyad in made["train"]:
         meeting, agent, _ = dyad.name.split("_")
@@ -227,9 +219,6 @@ def test_attention_is_what_was_annotated_and_unknown_where_nobody_is_seen(tables
             stretch = composed.Stretch(person=people[meeting, "B"], start_s=24.0, end_s=48.0)
             told = composed.attention_of(stretch)
             assert (told[1 * 25 : 5 * 25] == 1).all() and (told[7 * 25 : 11 * 25] == 0).all()
-
-
-def test_attention_is_unknown_where_nobody_annotated_gaze(tables):
     (folder_person, *_) = [person for person in ami.read_people(tables) if person.agent == "B"]
     blind = replace(folder_person, gaze_known=frozenset(), looked_at=())
     assert np.isnan(composed.attention_of(composed.Stretch(person=blind, start_s=20.0, end_s=50.0))).all()
@@ -275,8 +264,6 @@ def test_no_voice_take_or_series_is_in_two_parts(motions):
 
 
 # --- the listener's motion --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(6))
 def test_motion_stays_in_range_and_never_jumps(motions, seed):
     motion = act(busy(), motions["train"], np.random.default_rng(seed)).motion
@@ -315,12 +302,17 @@ def test_events_are_in_the_motion(motions, split):
     assert np.mean(np.array(late) <= 0.081) > 0.85 and np.mean(sized) > 0.85
 
 
-def test_nothing_but_events_nods_or_smiles(motions):
+def test_nothing_but_events_nods_or_smiles_and_one_to_whom_nothing_happens_still_lives(motions):
     for seed in range(6):
         acted = act(score(60, gaze=busy().gaze), motions["train"], np.random.default_rng(seed))
         assert {event.kind for event in acted.events} == {"blink", "gaze_shift"}
         assert find_nods(acted.motion[:, PITCH] - acted.head_of_gaze_rad[:, 1], FRAME_HZ) == []
         assert find_smiles(acted.motion[:, CORNERS].mean(axis=1), FRAME_HZ) == []
+    motion = act(score(60), motions["train"], np.random.default_rng(0)).motion
+    assert find_nods(motion[:, PITCH], FRAME_HZ) == []
+    assert 8 <= len(find_blinks(motion[:, CHANNEL_INDEX["eyeBlinkLeft"]], FRAME_HZ)) <= 32
+    for second in range(0, 60, 5):  # the head never freezes
+        assert np.ptp(motion[second * 25 : second * 25 + 125, :3], axis=0).max() > np.deg2rad(0.1)
 
 
 def test_what_is_left_without_the_heads_gaze_does_not_know_where_he_looks(motions):
@@ -365,14 +357,6 @@ def test_nods_are_made_as_a_person_makes_them():
         assert 0.3 <= one.duration_s / one.swings <= 0.66
 
 
-def test_a_listener_to_whom_nothing_happens_still_lives(motions):
-    motion = act(score(60), motions["train"], np.random.default_rng(0)).motion
-    assert find_nods(motion[:, PITCH], FRAME_HZ) == []
-    assert 8 <= len(find_blinks(motion[:, CHANNEL_INDEX["eyeBlinkLeft"]], FRAME_HZ)) <= 32
-    for second in range(0, 60, 5):  # the head never freezes
-        assert np.ptp(motion[second * 25 : second * 25 + 125, :3], axis=0).max() > np.deg2rad(0.1)
-
-
 def test_eyes_keep_their_target_while_the_head_nods(motions):
     motion = act(score(10, nods=np.array([(4.0, 5.0)])), motions["train"], np.random.default_rng(1)).motion
     nodding = slice(100, 125)
@@ -380,15 +364,12 @@ def test_eyes_keep_their_target_while_the_head_nods(motions):
     assert np.corrcoef(up, motion[nodding, PITCH])[0, 1] > 0.7
 
 
-def test_mirroring_twice_is_nothing(motions):
+def test_mirroring_twice_is_nothing_and_a_mirrored_listener_looks_the_other_way(motions):
     motion = act(score(5), motions["train"], np.random.default_rng(0)).motion
     np.testing.assert_array_equal(mirrored(mirrored(motion)), motion)
     left, right = (BLENDSHAPES.index(f"mouthSmile{side}") for side in ("Left", "Right"))
     np.testing.assert_array_equal(mirrored(motion)[:, SHAPES][:, left], motion[:, SHAPES][:, right])
     np.testing.assert_array_equal(mirrored(motion)[:, POSE][:, 2], -motion[:, POSE][:, 2])
-
-
-def test_a_mirrored_listener_looks_the_other_way_as_his_events_say(motions):
     sides = set()
     for seed in range(12):
         acted = act(score(10, gaze=((3.0, 6.0, "side B"),)), motions["train"], np.random.default_rng(seed))
@@ -401,7 +382,7 @@ def test_a_mirrored_listener_looks_the_other_way_as_his_events_say(motions):
     assert sides == {True, False}
 
 
-def test_voice_fills_exactly_the_segments(katie):
+def test_a_voice_fills_exactly_its_segments_and_a_mouth_moves_only_in_them(katie):
     segments = np.array([[1.0, 2.5], [4.0, 9.0], [9.5, 9.8]])
     audio, mouth = lay(segments, 300, katie, np.random.default_rng(0))
     times = np.arange(len(audio)) / 16_000
@@ -411,9 +392,6 @@ def test_voice_fills_exactly_the_segments(katie):
     assert mouth is None
     assert not audio[~inside].any()
     assert phrase_ends(voice_activity(audio), FRAME_HZ)[:2] == pytest.approx([2.5, 9.0], abs=0.13)
-
-
-def test_a_mouth_moves_only_while_its_voice_sounds():
     voice = read_voice(data_dir("sim") / "speakers" / "facegood_1114_3_16" / "speech.flac")
     _, mouth = lay(np.array([[2.0, 6.0]]), 250, voice, np.random.default_rng(0))
     assert mouth[:, BLENDSHAPES.index("jawOpen")].max() > 0.1
@@ -434,33 +412,21 @@ def test_gaps_under_a_fifth_of_a_second_are_no_pause():
     assert ami.phrases([(3, 4), (0, 1), (1.1, 2), (0.5, 1.05)]).tolist() == [[0, 2], [3, 4]]
 
 
-def test_a_missing_table_is_named(tmp_path):
+def test_what_cannot_be_composed_is_one_line(tmp_path, tables):
     with pytest.raises(ConfigError, match=r"head_gestures.csv.gz: no such file"):
         ami.read_people(tmp_path)
-
-
-def test_a_missing_column_is_named(tmp_path, tables):
     for file in tables.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / "words.csv").write_text("meeting,agent,start_s,end_s,kind\n")
     with pytest.raises(ConfigError, match=r"words.csv: column = 'text' is missing"):
         ami.read_people(tmp_path)
-
-
-def test_minutes_below_zero_are_refused(tables):
-    with pytest.raises(ConfigError, match="--minutes -1: must be above 0"):
-        compose(tables, VOICES, seed=1, minutes=-1)
-
-
-def test_a_folder_without_voices_is_refused(tables, tmp_path):
     with pytest.raises(ConfigError, match="no WAV or FLAC file to take voices from"):
         compose(tables, [tmp_path], seed=1, minutes=1)
-
-
-def test_a_broken_motion_file_is_named(tmp_path):
     (tmp_path / "motions.npz").write_bytes(b"nothing")
     with pytest.raises(ConfigError, match="motions.npz: not a file of motion primitives"):
         read_motions(tmp_path / "motions.npz")
+    with pytest.raises(ConfigError, match="--minutes -1: must be above 0"):
+        compose(tables, VOICES, seed=1, minutes=-1)
 
 
 @pytest.mark.slow

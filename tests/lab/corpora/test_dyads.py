@@ -107,8 +107,6 @@ def test_broken_file_is_one_clear_line(tmp_path, content):
 
 
 # --- sets of them ---------------------------------------------------------------------------------------------
-
-
 def lazy(*dyads: Dyad | Exception) -> tuple[Dataset, list[int]]:
     """A set that notes what is read."""
     read: list[int] = []
@@ -127,11 +125,14 @@ def lazy(*dyads: Dyad | Exception) -> tuple[Dataset, list[int]]:
     ), read
 
 
-def test_nothing_is_read_before_it_is_asked_for():
+def test_nothing_is_read_before_it_is_asked_for_and_mistakes_of_ours_are_no_broken_files():
     dataset, read = lazy(dyad(), dyad(), dyad())
     part = dataset.map(lambda one: replace(one, name="b"))[1:]
     assert read == [] and dataset.lengths == (20, 20, 20) and dataset.minutes == pytest.approx(60 / 25 / 60)
     assert part[0].name == "b" and read == [1]
+    dataset, _ = lazy(ZeroDivisionError())
+    with pytest.raises(ZeroDivisionError):
+        dataset[0]
 
 
 @pytest.mark.parametrize(
@@ -142,9 +143,3 @@ def test_any_way_of_breaking_is_a_named_problem(error):
     with pytest.raises(ClipError) as found:
         dataset[1]
     assert found.value.problem.kind == "unreadable"
-
-
-def test_mistakes_of_ours_are_not_taken_for_broken_files():
-    dataset, _ = lazy(ZeroDivisionError())
-    with pytest.raises(ZeroDivisionError):
-        dataset[0]

@@ -19,23 +19,17 @@ TAKE = {"train": "yes1", "validation": "apfel", "test": "facial"}
 cut = runpy.run_path(str(Path(__file__).parents[3] / "scripts" / "cut_recordings.py"))
 
 
-def test_every_swing_of_a_nodding_head_is_cut_and_normalised():
+def test_every_swing_is_cut_and_normalised_slow_motion_kept_and_a_resting_face_zero():
     times = np.arange(10 * FRAME_HZ) / FRAME_HZ
     found = cut["cycles"](np.deg2rad(4) * (0.5 - 0.5 * np.cos(2 * np.pi * 2 * times)), FRAME_HZ)
     assert 16 <= len(found) <= 20
     for cycle in found:
         assert cycle[0] == cycle[-1] == 0 and cycle.max() == pytest.approx(1)
     assert cut["cycles"](np.full(250, 0.1), FRAME_HZ) == []
-
-
-def test_slow_motion_is_kept_and_fast_motion_is_not():
     times = np.arange(40 * FRAME_HZ) / FRAME_HZ
     drift, tremor = np.sin(2 * np.pi * 0.1 * times), np.sin(2 * np.pi * 4 * times)
     kept = slow(np.stack([drift, tremor], axis=1))[100:-100]
     assert np.ptp(kept[:, 0]) == pytest.approx(2, abs=0.1) and np.ptp(kept[:, 1]) < 0.05
-
-
-def test_a_resting_face_is_zero_and_a_lost_one_holds():
     face = np.full((40, len(BLENDSHAPES)), 0.3, np.float32)
     face[10:20] = np.nan
     assert not cut["neutral"](face, 50).any()

@@ -52,14 +52,11 @@ def test_motion_keeps_its_place_in_time(fps):
     assert abs(int(ours.listening.sum()) - 25) <= 1
 
 
-def test_a_face_unknown_for_a_while_stays_unknown_there():
+def test_a_face_unknown_for_a_while_stays_so_and_what_cannot_be_resampled_is_said():
     one = dyad(90, 30.0)
     one.speaker[30:60] = np.nan
     known = np.isfinite(at_frame_rate(one).speaker).all(axis=1)
     assert known[:24].all() and not known[26:49].any() and known[51:].all()
-
-
-def test_what_cannot_be_resampled_is_said():
     with pytest.raises(ConfigError, match="30 fps in deca56, a listener is streamed at 25"):
         at_frame_rate(dyad(90, 30.0, "deca56"))
     with pytest.raises(ConfigError, match="not one frame"):

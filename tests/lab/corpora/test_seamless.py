@@ -43,8 +43,6 @@ def rows_of(root, name, key):
 
 
 # --- laws -------------------------------------------------------------------------------------------------------
-
-
 def test_partners_swapped_give_the_swapped_dyad(tmp_path):
     write.seamless(tmp_path, interactions=1)
     one, two = open_dataset(tmp_path, "train")
@@ -148,8 +146,6 @@ def test_every_unit_with_a_shape_moves_it_and_nothing_else():
 
 
 # --- which way numbers point ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_key_points_tell_which_way_heads_turn(mirrored, tmp_path):
     write.seamless(tmp_path, 2)
@@ -168,13 +164,13 @@ def test_key_points_tell_which_way_heads_turn(mirrored, tmp_path):
     np.testing.assert_allclose(dataset[0].listener[:, :3], wanted, atol=1e-6)
 
 
-def test_without_key_points_signs_are_said_to_be_unverified(tmp_path):
+def test_without_key_points_signs_are_unverified_and_archives_still_packed_are_named(tmp_path):
     assert "unverified" in scanned(write.seamless(tmp_path)).notes[-1]
+    (tmp_path / "improvised/train/0000/0044.tar").write_bytes(b"")
+    assert "0044.tar" in str(scanned(tmp_path).problems[0]) and "unpack" in str(scanned(tmp_path).problems[0])
 
 
 # --- what is there, and what is not -----------------------------------------------------------------------------
-
-
 def test_newer_movement_replaces_the_older(tmp_path):
     write.seamless(tmp_path, 1)
     newer = {f"movement_v4:{key.split(':')[1]}": rows_of(tmp_path, ONE, key) for key in (ROTATION, UNITS, VALID)}
@@ -203,14 +199,14 @@ def test_check_says_what_was_found_and_under_which_licence(tmp_path, command_lin
     assert command_line("data", "check", tmp_path, "--json").told["licence"].startswith("CC BY-NC 4.0")
 
 
-def test_training_on_them_names_the_licence(tmp_path, caplog):
+def test_training_on_them_names_the_licence_and_unconverted_the_way(tmp_path, caplog):
     open_dataset(write.seamless(tmp_path), "train")
     assert "CC BY-NC 4.0" in caplog.text
+    with pytest.raises(ConfigError, match="seamless27, which cannot become arkit58; `sfms-robot data convert`"):
+        open_for("arkit58", tmp_path, "train")
 
 
 # --- bad input --------------------------------------------------------------------------------------------------
-
-
 def vad(change):
     def harm(root):
         file = file_of(root, ONE, ".json")
@@ -292,14 +288,3 @@ def test_a_voice_beside_its_annotation_is_a_wrong_time_stamp(tmp_path):
     (problem,) = report["splits"][0]["problems"]
     assert problem["kind"] == "time stamps" and problem["count"] == 2  # of both clips
     assert "the voice comes +0.8" in problem["first"] and f"metadata:vad of {ONE}" in problem["first"]
-
-
-def test_archives_are_named_when_they_are_still_packed(tmp_path):
-    write.seamless(tmp_path)
-    (tmp_path / "improvised/train/0000/0044.tar").write_bytes(b"")
-    assert "0044.tar" in str(scanned(tmp_path).problems[0]) and "unpack" in str(scanned(tmp_path).problems[0])
-
-
-def test_training_on_it_unconverted_names_the_way(tmp_path):
-    with pytest.raises(ConfigError, match="seamless27, which cannot become arkit58; `sfms-robot data convert`"):
-        open_for("arkit58", write.seamless(tmp_path), "train")

@@ -39,13 +39,10 @@ def clips(tmp_path):
     return tmp_path
 
 
-def test_laughs_that_nobody_speaks_into_are_taken_to_the_part_of_their_clip(clips):
+def test_laughs_that_nobody_speaks_into_go_to_the_part_of_their_clip_and_sound_in_their_spans_alone(clips):
     found = find_laughter([clips])
     assert [len(one) for one in found["train"]] == [round(0.8 * AUDIO_HZ)]
     assert found["validation"] == found["test"] == []
-
-
-def test_laughs_sound_in_their_spans_alone(clips):
     quiet = np.zeros(4 * AUDIO_HZ, np.float32)
     spans = np.array([[0.5, 1.0], [2.0, 3.5]])
     laughing = laugh(quiet, spans, find_laughter([clips])["train"], np.random.default_rng(0))

@@ -5,14 +5,7 @@ import pytest
 
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, ListenerEvent
-from sfms_robot.lab.evaluation.detection import (
-    Detected,
-    DetectorCalibration,
-    Sightings,
-    asked_and_seen,
-    paired,
-    seen,
-)
+from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, Sightings, asked_and_seen, paired, seen
 from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.events import find_nods
 from sfms_robot.signals.motion_primitives import read_motions
@@ -58,7 +51,7 @@ def looking_down(starts_s, deg):
     return motion
 
 
-def test_a_look_down_and_back_is_no_nod_and_hides_none():
+def test_a_look_down_is_no_nod_hides_none_and_eyes_that_nobody_tracked_change_no_size():
     looks = looking_down(STARTS, 16)
     assert len(find_nods(looks[:, 1], FRAME_HZ)) > len(STARTS) / 2 and not seen(looks, "nod")
     asked, nods = nodding(STARTS + 2)
@@ -66,9 +59,6 @@ def test_a_look_down_and_back_is_no_nod_and_hides_none():
     both[:, 1] += nods[:, 1]
     assert len(seen(both, "nod")) == len(asked)
     np.testing.assert_allclose([size for *_, size in seen(both, "nod")], np.radians(6), rtol=0.2)
-
-
-def test_a_nod_of_eyes_that_nobody_tracked_keeps_its_size():
     _, motion = nodding(STARTS)
     assert seen(motion, "nod") == find_nods(motion[:, 1], FRAME_HZ) and len(seen(motion, "nod")) == len(STARTS)
 
@@ -105,13 +95,10 @@ def test_blinks_and_smiles_are_seen_too():
         assert (known.known[kind].recall, known.known[kind].precision) == (1.0, 1.0)
 
 
-def test_each_is_in_one_pair_and_the_nearest_go_together():
+def test_each_is_in_one_pair_and_recall_for_other_sizes_goes_by_that_at_each_size():
     assert paired(np.array([1.0, 1.3]), np.array([1.25]), 0.5) == [(1, pytest.approx(-0.05))]
     assert paired(np.array([1.0, 5.0]), np.array([1.1, 1.2, 9.0]), 0.5) == [(0, pytest.approx(0.1))]
     assert paired(np.zeros(0), np.array([1.0]), 0.5) == []
-
-
-def test_recall_for_other_sizes_goes_by_the_recall_at_each_size():
     known = Sightings(np.array([1.0, 1, 1, 1, 5, 5]), np.array([1.0, 0, 0, 0, 1, 1]), 3, np.zeros(3))
     assert known.recall_at(np.full(9, 1.2), (0, 3, 9)) == 0.25
     assert known.recall_at(np.array([1.0, 5.0]), (0, 3, 9)) == pytest.approx(0.625)

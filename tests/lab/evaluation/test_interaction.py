@@ -24,8 +24,6 @@ def talk(frames: int = 500, seed: int = 0) -> np.ndarray:
 
 
 # --- states ---------------------------------------------------------------------------------------------------------
-
-
 def test_confusion_counts_frames_that_have_both_and_adds_up():
     table = scores.confusion(np.array([0, 1, 1, -1], np.int8), np.array([0, 1, 0, 2], np.int8))
     assert table.sum() == 3 and table[0, 0] == table[1, 1] == table[0, 1] == 1
@@ -42,8 +40,6 @@ def test_a_listener_hears_the_user_one_frame_late_and_itself_at_once():
 
 
 # --- lips -----------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("lag", [-3, 0, 2])
 def test_the_lag_of_a_jaw_is_found(lag):
     values = talk(600)
@@ -54,39 +50,28 @@ def test_the_lag_of_a_jaw_is_found(lag):
     assert found["jaw_spread"] == pytest.approx(0.5, abs=0.02)
 
 
-def test_a_still_jaw_follows_nothing():
+def test_a_still_jaw_follows_nothing_short_clips_do_not_count_and_each_is_taken_less_its_mean():
     found = scores.jaw_tracking([jaw(np.zeros(100))], [jaw(talk(100))])
     assert found["correlation"] == 0 and found["jaw_spread"] == 0
-
-
-def test_a_clip_too_short_to_be_shifted_does_not_count():
     first, short = talk(100), talk(20)
     assert scores.jaw_tracking([jaw(first), jaw(-short)], [jaw(first), jaw(short)]) == scores.jaw_tracking(
         [jaw(first)], [jaw(first)]
     )
     assert scores.jaw_tracking([jaw(short)], [jaw(short)])["correlation"] == 0
-
-
-def test_clips_are_each_taken_less_their_own_mean():
     first, second = talk(200), talk(200, seed=1)
     found = scores.jaw_tracking([jaw(first), jaw(second + 5)], [jaw(first), jaw(second)])
     assert found["correlation"] == pytest.approx(1, abs=1e-4)
 
 
 # --- smoothness -----------------------------------------------------------------------------------------------------
-
-
 def turning(frames: int = 3000) -> np.ndarray:
     motion = np.zeros((frames, 58))
     motion[:, :3] = np.random.default_rng(0).normal(size=(frames, 3)).cumsum(0)
     return motion
 
 
-def test_motion_that_knows_no_chunks_has_a_ratio_of_one():
+def test_motion_without_chunks_has_a_ratio_of_one_and_jumps_are_seen_at_borders_alone():
     assert scores.border_ratio([turning()], 6) == pytest.approx(1, abs=0.08)
-
-
-def test_jumps_at_borders_are_seen_and_jumps_elsewhere_are_not():
     motion = turning()
     for at, high in ((1, True), (4, False)):  # frame 1 is the first of chunk 0
         jumped = motion + 30 * ((np.arange(len(motion)) - at) // 6 % 2)[:, None]
@@ -102,8 +87,6 @@ def test_a_jaw_that_stays_open_after_speech_is_seen():
 
 
 # --- played ---------------------------------------------------------------------------------------------------------
-
-
 def test_the_agents_sound_comes_one_frame_early():
     one = dyad("a", "interaction", 0)
     frames = frames_of_dyad(one)
@@ -115,21 +98,16 @@ def test_the_agents_sound_comes_one_frame_early():
 
 
 # --- tables ---------------------------------------------------------------------------------------------------------
-
-
 def clips(seed: int = 0) -> np.ndarray:
     walk = np.random.default_rng(seed).normal(size=(3, 250, 58)).cumsum(1)
     return 0.01 * walk
 
 
-def test_the_truth_is_at_no_distance_of_itself():
+def test_the_truth_is_at_no_distance_of_itself_and_a_still_face_has_no_variance():
     found = tables.scores(clips(), clips(), clips(1), CENTRES)
     for part in ("exp", "pose"):
         assert found[f"FD {part}"] == pytest.approx(0, abs=1e-6) and found[f"RPCC {part}"] == 0
         assert 0 < found[f"SID {part}"] <= np.log2(tables._CLUSTERS[part])
-
-
-def test_a_still_face_has_no_variance_and_no_diversity():
     found = tables.scores(clips(), np.zeros_like(clips()), clips(1), CENTRES)
     assert found["Var exp"] == found["Var pose"] == 0
     assert found["SID exp"] == pytest.approx(0, abs=1e-5) and np.isnan(found["RPCC exp"])

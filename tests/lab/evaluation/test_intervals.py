@@ -31,25 +31,16 @@ def test_an_interval_holds_the_truth_at_about_its_level():
     assert 0.88 <= held / 300 <= 0.98  # 0.95, less a little for so few people
 
 
-def test_the_value_is_that_of_the_sums():
+def test_values_are_those_of_the_sums_and_none_without_a_count_a_second_person_or_most_draws():
     rows = [
         {"a": np.array([3.0, 1.0]), "b": np.array([1.0, 2.0])},
         {"a": np.array([1.0, 3.0]), "b": np.array([3.0, 2.0])},
     ]
     found = estimates({"a": quotient("a"), "a over b": ratio("a", "b")}, rows, seed=1)
     assert (found["a"].value, found["a over b"].value) == (1.0, 1.0)
-
-
-def test_what_nothing_was_counted_of_is_none():
     found = estimates({"a": quotient("a"), "r": ratio("b", "a")}, [{"a": np.zeros(2), "b": np.ones(2)}] * 5, seed=1)
     assert found["a"].value is None and found["a"].interval is None and found["r"].value is None
-
-
-def test_one_person_has_no_interval():
     assert estimates({"a": quotient("a")}, [{"a": np.ones(2)}], seed=1)["a"].interval is None
-
-
-def test_a_figure_that_most_draws_do_not_have_has_no_interval():
     rows = [{"a": np.array([1.0, 1.0])}, *[{"a": np.zeros(2)}] * 9]
     found = estimates({"a": quotient("a")}, rows, seed=1)["a"]
     assert found.value == 1.0 and found.interval is None
@@ -62,8 +53,6 @@ def test_the_distance_of_two_histograms():
 
 
 # --- metrics that pool all clips --------------------------------------------------------------------------------
-
-
 def _mean_of(values):
     return lambda clips: {"mean": float(values[clips].mean()), "unknown": float("nan")}
 
@@ -88,19 +77,13 @@ def test_clips_of_one_person_hang_together() -> None:
     assert bootstrap(_mean_of(values), ["a", "b"] * 150) == {}
 
 
-def test_a_figure_that_cannot_be_negative_has_no_negative_end() -> None:
+def test_an_interval_of_clips_is_never_negative_and_widens_with_trainings_that_differ() -> None:
     values = np.random.default_rng(2).exponential(1.0, 6) ** 4
     assert _interval(values, [*"abcdef"])["mean"][0] > 0
-
-
-def test_trainings_that_differ_widen_the_interval() -> None:
     values = np.repeat([0.0, 1.0, 5.0], 10) + np.tile(np.linspace(0, 0.1, 10), 3)
     people, runs = [*"abcdefghij"] * 3, np.repeat(range(3), 10).tolist()
     (low, high), (near, far) = (_interval(values, people, runs=each)["mean"] for each in (runs, ()))
     assert high - low > 10 * (far - near)
-
-
-def test_rows_are_compared_over_the_same_people() -> None:
     values = np.random.default_rng(3).normal(0, 5, 20)
     people = [str(number) for number in range(20)]
     ours, theirs = (bootstrap(_mean_of(each), people)["mean"] for each in (values + 0.1, values))

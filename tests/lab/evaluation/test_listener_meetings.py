@@ -53,15 +53,12 @@ def test_it_is_as_it_was(person, one):
     assert not one.listening[at(100) : at(110)].any() and not one.listening[at(80) : at(82)].any()
 
 
-def test_the_one_who_speaks_looks_at_him_when_the_annotation_says_so(one):
+def test_the_speaker_looks_at_him_as_annotated_and_two_at_once_speak_to_nobody(one):
     assert np.isnan(one.attention[: at(1)]).all()  # nobody has the floor yet
     assert (one.attention[at(1.1) : at(1.9)] == 1).all()
     assert (one.attention[at(61.5) : at(61.9)] == 0).all()
     assert [frame.attention for frame in one.speaker[at(2) : at(2) + 3]] == [1.0, 1.0, 1.0]
     assert all(frame.face is not None for frame in one.speaker)
-
-
-def test_two_who_speak_at_once_speak_to_nobody_in_particular(one):
     assert one.alone[at(1.5)] and not one.alone[at(2.2)]
     assert one.addressed[at(1.5)] and not one.addressed[at(2.2)]
     assert one.bystander[at(66.5)] and not one.addressed[at(66.5)]
@@ -83,14 +80,11 @@ def test_inside_a_nod_is_after_its_first_instant_and_before_its_end(one):
     assert (one.instants("nod")[0] + 1) * FRAME_S <= start + 1e-9
 
 
-def test_a_look_aside_might_begin_while_he_looks_at_the_speaker(one):
+def test_a_look_aside_might_begin_while_he_looks_at_the_speaker_and_nods_where_none_is_under_way(one):
     onsets, might = one.begins("gaze_shift")
     assert onsets.tolist() == [at(40) - 1]
     assert one.looks_at_speaker[at(2.1) : at(40)].all() and not one.looks_at_speaker[at(40) : at(50)].any()
     assert not (might & ~one.listening).any() and might[at(39)]
-
-
-def test_nods_might_begin_where_none_is_under_way(one):
     onsets, might = one.begins("nod")
     assert not (might & one.inside("nod")).any() and might[onsets].all() and len(onsets) > 15
 

@@ -10,44 +10,35 @@ from sfms_robot.lab.evaluation import metrics
 RNG = np.random.default_rng(3)
 
 
-def test_frechet_equals_the_matrix_root():
+def test_frechet_equals_the_matrix_root_and_paired_sees_what_it_cannot():
     a, b = RNG.normal(size=(3, 200, 6)), RNG.normal(0.5, 2.0, size=(3, 200, 6))
     x, y = a.reshape(-1, 6), b.reshape(-1, 6)
     sx, sy = np.cov(x.T), np.cov(y.T)
     gap = x.mean(0) - y.mean(0)
     expected = gap @ gap + np.trace(sx + sy - 2 * np.real(linalg.sqrtm(sx @ sy)))
     assert metrics.frechet_distance(a, b) == pytest.approx(expected, rel=1e-9)
-
-
-def test_paired_frechet_sees_what_frechet_cannot():
     speaker = RNG.normal(size=(4, 500, 2))
     target, other = speaker.copy(), RNG.normal(size=(4, 500, 2))
     assert metrics.frechet_distance(target, other) < 0.02
     assert metrics.paired_frechet_distance(target, other, speaker) > 1.0
 
 
-def test_the_three_variances():
+def test_variances_and_l2_are_their_definitions():
     x = RNG.normal(size=(5, 30, 4)) * [1, 2, 3, 4] + [0, 10, 20, 30]
     assert metrics.variance(x) == pytest.approx(np.var(x))
     assert metrics.variance(x, "time") == pytest.approx(np.mean([np.var(c, axis=0).mean() for c in x]))
     assert metrics.variance(x, "sum") == pytest.approx(sum(np.var(x[..., d]) for d in range(4)))
-
-
-def test_l2_definitions():
     a, b = RNG.normal(size=(2, 40, 3)), RNG.normal(size=(2, 40, 3))
     assert metrics.l2(a, b) == pytest.approx(np.mean([np.linalg.norm(x) for x in (a - b).reshape(-1, 3)]))
     assert metrics.mse(a, b) == pytest.approx(((a - b) ** 2).mean())
 
 
-def test_shannon_index_of_even_use_is_log_k_and_of_one_cluster_nothing():
+def test_shannon_index_is_log_k_of_even_use_and_counts_nearest_centres():
     centres = np.arange(8.0)[:, None] * 10
     even = np.repeat(centres, 50, axis=0)[None]
     assert metrics.shannon_index(even, centres) == pytest.approx(np.log(8), abs=1e-4)
     assert metrics.shannon_index(even, centres, "bits") == pytest.approx(3.0, abs=1e-4)
     assert metrics.shannon_index(np.zeros((1, 100, 1)), centres) == pytest.approx(0.0, abs=1e-5)
-
-
-def test_shannon_index_counts_nearest_centres():
     reference, pred = RNG.normal(size=(4, 50, 3)), RNG.normal(size=(4, 50, 3))
     centres = metrics.cluster_centres(reference, 6)
 
@@ -63,16 +54,13 @@ def test_shannon_index_counts_nearest_centres():
         metrics.cluster_centres(np.zeros_like(reference), 3)
 
 
-def test_rpcc():
+def test_rpcc_and_sts_are_their_definitions():
     speaker = RNG.normal(size=(3, 200, 2))
     target, pred = 2 * speaker, RNG.normal(size=(3, 200, 2))
     r = np.corrcoef(pred.ravel(), speaker.ravel())[0, 1]
     assert metrics.rpcc_flat(target, pred, speaker) == pytest.approx(1 - r)
     assert metrics.rpcc_channels(target, target, speaker) == 0.0
     assert metrics.rpcc_channels(target, pred, speaker) == pytest.approx(1.0, abs=0.15)
-
-
-def test_sts_counts_the_borders_of_clips():
     a = np.zeros((2, 3, 1))
     b = a + np.array([0.0, 1.0])[:, None, None]
     assert metrics.sts(a, b) == pytest.approx(np.sqrt(1 / 0.1))
@@ -111,12 +99,6 @@ def test_dtw_equals_the_textbook_loop(sizes):
     a, b = RNG.normal(size=(sizes[0], 3)), RNG.normal(size=(sizes[1], 3))
     others = np.stack([b, b[::-1]])
     assert metrics.dtw(a, others) == pytest.approx([naive_dtw(a, other) for other in others], rel=1e-9)
-
-
-def test_dtw_forgives_a_pause():
-    x = RNG.normal(size=(30, 4))
-    held = np.concatenate([x[:10], np.repeat(x[10:11], 7, axis=0), x[11:]])
-    assert metrics.dtw(x, held[None]) == pytest.approx([0.0], abs=1e-6)
 
 
 def test_ccc_equals_its_definition_and_counts_constant_channels_as_zero():
@@ -160,10 +142,13 @@ def test_frc_and_frd_are_means_over_samples_and_contexts():
     assert metrics.frd(pred, target) == pytest.approx(frd / 6, rel=1e-9)
 
 
-def test_reactface_scales_by_ten_and_takes_any_width():
+def test_reactface_scales_by_ten_and_dtw_forgives_a_pause():
     pred, target = RNG.random((2, 1, 10, 58)), RNG.random((2, 10, 58))
     expected = np.mean([naive_dtw(target[n], pred[n, 0]) for n in range(2)])
     assert metrics.reactface_frd(pred, target) == pytest.approx(10 * expected, rel=1e-9)
+    x = RNG.normal(size=(30, 4))
+    held = np.concatenate([x[:10], np.repeat(x[10:11], 7, axis=0), x[11:]])
+    assert metrics.dtw(x, held[None]) == pytest.approx([0.0], abs=1e-6)
 
 
 def test_diversities_equal_the_sums_over_pairs():

@@ -61,15 +61,12 @@ def test_a_wider_swing_from_another_rest_is_told_apart_but_not_once_it_is_levell
     assert levelled(np.zeros((0, WINDOW, MOTION_DIM), np.float32)).shape == (0, WINDOW, MOTION_DIM)
 
 
-def test_windows_lie_side_by_side_and_short_motion_gives_none():
+def test_windows_lie_side_by_side_short_motion_gives_none_and_those_not_judged_are_left_out():
     rng = np.random.default_rng(0)
     assert windows(np.zeros((2 * WINDOW + 7, MOTION_DIM), np.float32), rng).shape == (2, WINDOW, MOTION_DIM)
     assert windows(np.zeros((WINDOW - 1, MOTION_DIM), np.float32), rng).shape == (0, WINDOW, MOTION_DIM)
     still = windows(np.zeros((60 * FRAME_HZ, MOTION_DIM), np.float32), rng)
     assert still.reshape(-1, MOTION_DIM).std(axis=0) == pytest.approx(_NOISE, rel=0.1)
-
-
-def test_windows_that_are_not_judged_as_a_whole_are_left_out():
     motion = sway(np.random.default_rng(0), 0.6, frames=4 * WINDOW + 7)
     judged = np.ones(len(motion), bool)
     judged[[WINDOW, 4 * WINDOW + 3]] = False
@@ -77,11 +74,8 @@ def test_windows_that_are_not_judged_as_a_whole_are_left_out():
     np.testing.assert_array_equal(some, every[[0, 2, 3]])
 
 
-def test_regions_hold_every_channel_once():
+def test_regions_hold_every_channel_once_and_too_few_dyads_are_refused():
     assert sorted(index for channels in REGIONS.values() for index in channels) == list(range(MOTION_DIM))
-
-
-def test_too_few_dyads_are_refused():
     part = [np.zeros((3, WINDOW, MOTION_DIM), np.float32)] * 3
     with pytest.raises(ValueError, match="got 3 and 3"):
         separability(part, part, "head")

@@ -71,14 +71,10 @@ def told_settings(**changes) -> config.Sfms:
     return settings(events=True, sway=True, placement="penalised", groups=groups, **changes)
 
 
-def test_how_nods_die_away_is_found_at_every_size():
+def test_how_nods_die_away_is_found_at_every_size_and_not_of_single_swings():
     asked = told_settings(sampling={"nod": {"spread": 0.1}})
     found = coursed(asked, [nodding(np.linspace(0.04, 0.2, LEAST))]).sampling.nod
     assert found.fall == pytest.approx(0.6, abs=0.02) and found.spread == 0.1
-
-
-def test_single_swings_tell_nothing_of_how_nods_die_away():
-    asked = told_settings(sampling={"nod": {"spread": 0.1}})
     single = nodding([0.1] * LEAST)
     single = replace(single, events=tuple(replace(event, swings=1) for event in single.events))
     assert coursed(asked, [single]) == asked
@@ -98,16 +94,12 @@ def smiling(count: int) -> Dyad:
     return made_dyad(motion, events=tuple(smiles))
 
 
-def test_the_course_of_smiles_is_found_at_every_size():
+def test_the_course_of_smiles_is_found_at_every_size_and_not_of_too_few():
     asked = told_settings(sampling={"smile": {"spread": 0.1}})
     found = coursed(asked, [smiling(LEAST)]).sampling.smile
     np.testing.assert_allclose(found.rise, np.array(found.RISE_S) / 0.96, atol=2e-3)
     np.testing.assert_allclose(found.fall, np.array(found.FALL_S) / 0.96, atol=2e-3)
     assert found.spread == 0.1
-
-
-def test_too_few_smiles_tell_no_course_and_a_listener_without_gets_none():
-    asked = told_settings(sampling={"smile": {"spread": 0.1}})
     assert coursed(asked, [smiling(LEAST - 1)]) == asked
     assert coursed(asked, []) == asked
     assert coursed(told_settings(), [smiling(LEAST)]) == told_settings()

@@ -48,9 +48,13 @@ def sparse(placement: str = "static", preset: str = "four", k: int = 3) -> confi
     return parse(config.Recipe, {"model": listener, "training": TRAINING}, "sparse")
 
 
-def dense() -> config.Recipe:
-    raw = {"kind": "dense", "quantizer": "fsq", "levels": [4, 4], "width": 16, "layers": 1}
+def dense(**more: object) -> config.Recipe:
+    raw = {"kind": "dense", "quantizer": "fsq", "levels": [4, 4], "width": 16, "layers": 1, **more}
     return parse(config.Recipe, {"model": raw, "training": TRAINING}, "dense")
+
+
+def grouped(**more: object) -> config.Recipe:
+    return dense(**{"kind": "grouped", "quantizer": "vq", "levels": [32]} | more)
 
 
 def faces(frames: int = 200, seed: int = 1) -> list[Take]:
@@ -72,33 +76,31 @@ def test_the_bundled_takes_hold_out_what_they_say() -> None:
     assert sum(len(take.motion) for take in found["train"]) > 9_000
 
 
-def test_a_broken_file_of_takes_is_named(tmp_path: Path) -> None:
+def test_a_broken_file_of_takes_or_history_is_named(tmp_path: Path) -> None:
     (tmp_path / "t.npz").write_bytes(b"nothing")
     with pytest.raises(ConfigError, match=r"t\.npz: not a file of recorded takes"):
         read_takes(tmp_path / "t.npz")
+    assert load_history(tmp_path) == []
+    (tmp_path / "history.json").write_text('[{"stride": 1}]')
+    with pytest.raises(ModelError, match=r"history\.json: not the history of a tokenizer"):
+        load_history(tmp_path)
 
 
-def test_windows_lie_in_one_take_and_do_not_overlap() -> None:
+def test_windows_lie_in_one_take_do_not_overlap_and_need_one_that_is_long_enough() -> None:
     motion = faces(130)[0].motion
     seen = Windows.of([Take("a", motion[:100]), Take("short", motion[:20]), Take("b", motion[80:])], 48)
     assert seen.takes == ("a", "a", "b")
     np.testing.assert_array_equal(seen.motion[1].numpy(), motion[48:96])
     np.testing.assert_array_equal(seen.motion[2].numpy(), motion[80:128])
-
-
-def test_takes_that_are_all_too_short_are_refused() -> None:
     with pytest.raises(ConfigError, match="none of 1 stretches .* as long as a window of 48 frames"):
         Windows.of([Take("a", faces(40)[0].motion)], 48)
-
-
-def test_first_frames_of_short_takes_are_none() -> None:
     assert first_frames([10, 50, 49], 48).tolist() == [10, 11, 12, 60, 61]
     assert first_frames([10], 48).tolist() == []
 
 
 @pytest.mark.parametrize(
     "recipe",
-    [sparse(), sparse("learned"), sparse("learned_paper"), sparse("adaptive"), dense()],
+    [sparse(), sparse("learned"), sparse("learned_paper"), sparse("adaptive"), dense(), grouped()],
     ids=lambda r: r.model.kind,
 )
 def test_any_recipe_trains_is_kept_and_scores_the_same_again(recipe: config.Recipe, tmp_path: Path) -> None:
@@ -127,7 +129,7 @@ def test_places_cost_bits_only_where_nobody_expects_them() -> None:
     assert TableModel(sparse("learned", k=4)).bits() > learned.bits()
 
 
-def test_a_score_is_in_deviations_of_the_training_motion() -> None:
+def test_scores_are_in_deviations_of_the_training_motion_and_count_every_channel_the_same() -> None:
     one = TableModel(dense())
     motion = torch.from_numpy(faces()[0].motion)
     one.fit_scales(motion)
@@ -136,9 +138,6 @@ def test_a_score_is_in_deviations_of_the_training_motion() -> None:
     assert float(found.std(0).mean()) == pytest.approx(1, abs=0.01)
     one.fit_scales(torch.zeros(50, 58))
     assert float(one.motion_std.min()) == pytest.approx(0.005), "a still channel is not blown up"
-
-
-def test_a_window_error_counts_every_channel_the_same() -> None:
     wrong = torch.zeros(2, 48, 58)
     wrong[0, :, 0], wrong[1, :, 57] = 1.0, 2.0
     errors, angle_rmse_rad, shape_rmse = restoration_errors(TableModel(dense()), torch.zeros_like(wrong), wrong)
@@ -146,14 +145,11 @@ def test_a_window_error_counts_every_channel_the_same() -> None:
     assert angle_rmse_rad == pytest.approx(np.sqrt(0.5 / 3)) and shape_rmse == pytest.approx(np.sqrt(2 / 52))
 
 
-def test_every_table_needs_only_tokenizers_that_have_a_recipe() -> None:
+def test_names_say_seed_steps_and_learning_rate_and_every_table_needs_only_recipes() -> None:
     for name in tokenizer_tables.TABLES:
         assert set(tokenizer_tables.needed(name)) <= set(RECIPES)
     every = {name for table in tokenizer_tables.TABLES for name in tokenizer_tables.needed(table)}
     assert every == set(RECIPES), "none is trained in vain"
-
-
-def test_names_say_seed_steps_and_learning_rate() -> None:
     assert [recipe_of(name).seed for name in seeded("sparse-all-k3", 3)] == [1, 2, 3]
     written = "sparse-all-k7-as-written"
     assert (
@@ -162,6 +158,14 @@ def test_names_say_seed_steps_and_learning_rate() -> None:
     )
     assert recipe_of(f"{written}-slower-scores").training.score_learning_rate == 3e-4
     assert recipe_of(f"{written}-tempered").training.tempered_draws
+
+
+def test_a_dense_window_pays_for_every_frame_and_a_grouped_one_for_every_eight() -> None:
+    for recipe, codes, bits in ((dense(levels=[8, 5, 5, 5]), 48, np.log2(1000)), (grouped(), 6, 5)):
+        model = TableModel(recipe)
+        assert model.bits() == pytest.approx(codes * bits)
+    with pytest.raises(ConfigError, match="window_frames 20 is not a multiple of 8"):
+        TableModel(grouped(window_frames=20))
 
 
 def test_a_table_shares_the_inpainter_and_the_dimensions_of_its_codes() -> None:
@@ -215,13 +219,6 @@ def test_rows_that_cannot_be_had_are_named(options, said) -> None:
         tokenizer_tables.evaluate_table("3-placements", **options)
 
 
-def test_a_broken_history_is_named(tmp_path: Path) -> None:
-    assert load_history(tmp_path) == []
-    (tmp_path / "history.json").write_text('[{"stride": 1}]')
-    with pytest.raises(ModelError, match=r"history\.json: not the history of a tokenizer"):
-        load_history(tmp_path)
-
-
 def test_a_learning_tokenizer_leaves_a_history_of_its_scores(tmp_path: Path) -> None:
     seen = Windows.of(faces(), 48)
     train("one", sparse("learned"), faces(), tmp_path, Run(), seen.motion[:2])
@@ -266,20 +263,13 @@ def kinds(each: int = 5, seed: int = 0) -> np.ndarray:
     return np.stack(out)
 
 
-def test_kinds_are_found():
+def test_kinds_are_found_kept_by_whole_restoration_and_lost_where_codes_pull_them_together():
     _, labels = cluster(kinds(), 3)
     assert [len(set(labels[rows])) for rows in np.split(np.arange(15), 3)] == [1, 1, 1] and len(set(labels)) == 3
-
-
-def test_what_is_restored_as_it_was_keeps_all_of_it():
     motion = kinds()
     clusters = cluster(motion, 3)
     silhouette, separation = integrity(motion, motion, clusters)
     assert separation == pytest.approx(1) and silhouette > 0.5
-
-
-def test_codes_that_pull_kinds_together_are_seen():
-    motion = kinds()
     clusters, mean = cluster(motion, 3), motion.mean(0)
     kept, _ = integrity(motion, motion, clusters)
     rng = np.random.default_rng(1)

@@ -66,9 +66,15 @@ def test_a_scene_has_the_evidence_of_every_frame(speaker, addressed):
         np.testing.assert_array_equal(row, one.heard)
 
 
-def test_a_scene_without_a_microphone_hears_with_its_eyes(speaker):
+def test_a_scene_without_a_microphone_hears_with_its_eyes_and_nothing_is_asked_of_nothing(speaker):
     deaf = [SpeakerFrame(frame.time_s, np.zeros(0, np.float32), frame.face) for frame in speaker[:600]]
     assert scene_in(deaf).speaks[:, 1].any()
+    model = EventModel.load()
+    for frames in (0, 1, 2):
+        found = hazards_in(model, np.full((frames, len(HEARD)), np.nan), [], Calmness())
+        assert {len(values) for values in found.values()} == {frames}
+        blind = Sensed(0, np.full(len(HEARD), np.nan))
+        assert not model.decide_each([blind], [model.start(0)])[0][0].events
 
 
 @pytest.mark.parametrize("calmness", CALMNESS)
@@ -93,12 +99,3 @@ def test_no_history_makes_anything_likelier_than_the_most(rows, history):
             for at, kind in enumerate(model.bank.kinds):
                 assert (found[kind][steps] * 0.08 <= most[:, at]).all(), kind
     assert most[:, model.bank.kinds.index("blink")].max() == 0, "never, at no rate"
-
-
-def test_nothing_is_asked_of_nothing():
-    model = EventModel.load()
-    for frames in (0, 1, 2):
-        found = hazards_in(model, np.full((frames, len(HEARD)), np.nan), [], Calmness())
-        assert {len(values) for values in found.values()} == {frames}
-        blind = Sensed(0, np.full(len(HEARD), np.nan))
-        assert not model.decide_each([blind], [model.start(0)])[0][0].events

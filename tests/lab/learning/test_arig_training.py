@@ -14,28 +14,8 @@ from sfms_robot.config import parse_training
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, ListenerEvent, SpeakerFrame
-from sfms_robot.lab.learning.arig.features import (
-    SCENES,
-    cut,
-    fit_scales,
-    gather,
-    open_scenes,
-    reflection,
-)
-from sfms_robot.lab.learning.arig.trainer import (
-    GLIDE,
-    Student,
-    _glided,
-    augment,
-    channel_weights,
-    draw,
-    group_of,
-    loss_parts,
-    previous_states,
-    starts_by_event,
-    train_arig,
-    weights_of,
-)
+from sfms_robot.lab.learning.arig import trainer
+from sfms_robot.lab.learning.arig.features import SCENES, cut, fit_scales, gather, open_scenes, reflection
 from sfms_robot.lab.learning.train_runs import TrainOptions, train_settings
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.arig.event_curves import features
@@ -66,9 +46,9 @@ def corpus(data):
     return gather(open_scenes(data, "train"), WINDOW, ARKIT, A_LISTENER)
 
 
-def a_student(**changes) -> Student:
+def a_student(**changes) -> trainer.Student:
     torch.manual_seed(0)
-    return Student(ArigModel(settings(listener=changes).listener))
+    return trainer.Student(ArigModel(settings(listener=changes).listener))
 
 
 def fitted(corpus, **changes) -> ArigModel:
@@ -85,7 +65,7 @@ def quiet(**changes) -> config.ArigPhase:
 
 
 def augmented(told, model: ArigModel | None = None, **changes):
-    return augment(told, model or a_student().model, quiet(**changes), torch.Generator().manual_seed(0))
+    return trainer.augment(told, model or a_student().model, quiet(**changes), torch.Generator().manual_seed(0))
 
 
 def one_window(corpus):
@@ -99,7 +79,7 @@ def one_window(corpus):
     ids=lambda changes: "-".join(changes) or "full",
 )
 def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, changes):
-    figures = train_arig(settings(listener=changes, steps=4), data, tmp_path)
+    figures = trainer.train_arig(settings(listener=changes, steps=4), data, tmp_path)
     assert figures["steps"] == 4 and np.isfinite(figures["held_out_noise"])
     listener = load_folder(tmp_path)
     silence = np.zeros(FRAME_SAMPLES, np.float32)
@@ -111,14 +91,14 @@ def test_every_ablation_trains_into_a_listener_that_streams(data, tmp_path, chan
 @pytest.mark.parametrize("changes", [{}, {"discrete": True}, {"interaction": "linear"}], ids=str)
 def test_it_trains_in_16_bits(data, tmp_path, monkeypatch, changes):
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
-    figures = train_arig(settings(listener=changes, steps=3, precision="bf16"), data, tmp_path)
+    figures = trainer.train_arig(settings(listener=changes, steps=3, precision="bf16"), data, tmp_path)
     assert np.isfinite(figures["loss"])
 
 
 @pytest.mark.slow
 def test_losses_fall(data, tmp_path):
-    few = train_arig(settings(steps=2), data, tmp_path / "few")
-    more = train_arig(settings(steps=60), data, tmp_path / "more")
+    few = trainer.train_arig(settings(steps=2), data, tmp_path / "few")
+    more = trainer.train_arig(settings(steps=60), data, tmp_path / "more")
     for part in ("noise", "state", "coarse"):
         assert more[f"held_out_{part}"] < 0.9 * few[f"held_out_{part}"]
 
@@ -128,10 +108,10 @@ def test_the_curriculum_decides_where_windows_come_from(corpus):
     starts = corpus.starts_by_scene(WINDOW)
     generator = torch.Generator().manual_seed(0)
     first_of = {scene: (int(starts[scene].min()), int(starts[scene].max())) for scene in SCENES}
-    early = draw(starts, weights_of(phase.stage(0), starts), 50, generator)
+    early = trainer.draw(starts, trainer.weights_of(phase.stage(0), starts), 50, generator)
     low, high = first_of["speaking"]
     assert ((early >= low) & (early <= high)).all()
-    late = draw(starts, weights_of(phase.stage(99), starts), 300, generator)
+    late = trainer.draw(starts, trainer.weights_of(phase.stage(99), starts), 300, generator)
     shares = [((late >= low) & (late <= high)).float().mean() for low, high in first_of.values()]
     assert min(shares) > 0.05 and sum(shares) == pytest.approx(1)
 
@@ -140,22 +120,19 @@ def test_without_the_sets_that_speak_the_curriculum_goes_on_with_listening(data,
     shutil.copytree(data / "train", tmp_path / "train")
     shutil.copytree(data / "validation", tmp_path / "validation")
     whole = settings(steps=2, stages=[{"share": 1.0, "speaking": 1.0, "listening": 1.0}])
-    assert train_arig(whole, tmp_path, tmp_path / "out")["steps"] == 2
+    assert trainer.train_arig(whole, tmp_path, tmp_path / "out")["steps"] == 2
     assert "no train, the curriculum continues without it" in caplog.text
     with pytest.raises(ConfigError, match="a stage draws from speaking alone, the data have listening"):
-        train_arig(settings(steps=2), tmp_path, tmp_path / "out2")
+        trainer.train_arig(settings(steps=2), tmp_path, tmp_path / "out2")
 
 
-def test_a_silent_agent_may_lack_its_track_but_one_that_speaks_never(corpus):
+def test_a_silent_agent_may_lack_its_track_and_dropping_takes_a_whole_modality_and_its_voice(corpus):
     starts = corpus.starts_by_scene(WINDOW)
     told = cut(corpus, torch.cat([starts["speaking"][:20], starts["listening"][:20]]), WINDOW)
     found, _ = augmented(told, drop_agent=1)
     speaks = told.voiced[..., 0].any(1)
     assert speaks.any() and not speaks.all()
     assert torch.equal(found.agent_heard.any(1), speaks)
-
-
-def test_dropping_takes_a_whole_modality_and_its_voice(corpus):
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["interaction"][:10], WINDOW)
     found, _ = augmented(told, drop_audio=1, drop_face=1)
     assert told.voiced[..., 1].any()
@@ -203,7 +180,7 @@ def test_a_silent_user_is_heard_as_a_stream_hears_silence(corpus):
 
 def sounds_off(corpus, sound: str = "mel", **changes) -> torch.Tensor:
     """(400, N, A) what augmentation adds to the agent's sound."""
-    student = Student(ArigModel(settings({"sound": sound}).listener))
+    student = trainer.Student(ArigModel(settings({"sound": sound}).listener))
     told = one_window(corpus)
     if sound != "mel":
         zeros = torch.zeros(400, WINDOW, student.model.sound_width)
@@ -237,19 +214,6 @@ def test_half_of_the_pasts_are_off_and_what_comes_after_goes_a_tenth_of_the_way_
     assert float((off.flatten(1).abs().amax(1) < 1e-4).float().mean()) == pytest.approx(0.67, abs=0.1)  # 0.3 never jump
     after = (truth - told.agent_motion) / model.motion_std
     assert torch.allclose(after[:, 1:], 0.9 * off[:, :-1], atol=1e-4)
-
-
-def test_a_past_that_goes_elsewhere_glides_there_evenly():
-    """In as many frames in all of a window, 1 to `GLIDE`, and then stays: a glide is a jump in as many parts."""
-    jumps = torch.zeros(200, 40, 2)
-    jumps[:, 5], jumps[:, 9] = torch.tensor([1.0, -2.0]), torch.tensor([0.5, 0.0])
-    glided = _glided(jumps, torch.Generator().manual_seed(0))
-    assert torch.allclose(glided.sum(1), jumps.sum(1), atol=1e-5)
-    took = (glided[..., 1] != 0).sum(1)
-    assert took.min() == 1 and took.max() == GLIDE
-    for one, frames in zip(glided, took.tolist(), strict=True):
-        assert torch.allclose(one[5 : 5 + frames, 1], torch.full((frames,), -2.0 / frames), atol=1e-5)
-        assert not one[:5].any() and not one[5 + frames :, 1].any()
 
 
 def test_lips_of_who_speaks_are_off_by_more_and_where_its_sounds_put_them_at_once(corpus):
@@ -289,8 +253,8 @@ def test_a_step_never_leads_out_of_the_range_of_the_motion():
 
 def test_lost_states_are_drawn_and_unknown_ones_wait():
     states = torch.tensor([[3, -1] * 500])
-    assert torch.equal(previous_states(states, 0, torch.Generator(), 7)[0, :2], torch.tensor([3, FIRST]))
-    kept = previous_states(states, 0.7, torch.Generator().manual_seed(0), 7)[:, ::2] == 3
+    assert torch.equal(trainer.previous_states(states, 0, torch.Generator(), 7)[0, :2], torch.tensor([3, FIRST]))
+    kept = trainer.previous_states(states, 0.7, torch.Generator().manual_seed(0), 7)[:, ::2] == 3
     assert float(kept.float().mean()) == pytest.approx(0.3 + 0.7 / 7, abs=0.05)
 
 
@@ -301,7 +265,7 @@ def test_states_that_are_fed_back_do_not_come_from_the_labels(corpus, own):
     phase = quiet(own_states=own)
     with torch.no_grad():
         first, second = (
-            loss_parts(student, told, states, told.agent_motion, phase, torch.Generator().manual_seed(0)).motion
+            trainer.loss_parts(student, told, states, told.agent_motion, phase, torch.Generator().manual_seed(0)).motion
             for states in (torch.zeros_like(told.states), torch.full_like(told.states, 4))
         )
     assert torch.equal(first, second) == own
@@ -323,7 +287,9 @@ def test_unlabelled_frames_have_no_state_loss(corpus):
     student = a_student()
     told = cut(corpus, corpus.starts_by_scene(WINDOW)["listening"][:3], WINDOW)
     unknown = torch.full_like(told.states, -1)
-    parts = loss_parts(student, told, unknown, told.agent_motion, settings().training, torch.Generator().manual_seed(0))
+    parts = trainer.loss_parts(
+        student, told, unknown, told.agent_motion, settings().training, torch.Generator().manual_seed(0)
+    )
     assert float(parts.state) == 0
 
 
@@ -356,8 +322,6 @@ def test_what_is_wrong_in_a_training_file_is_said(raw, said):
 
 
 # --- events -----------------------------------------------------------------------------------------------------
-
-
 def test_a_dyad_whose_events_nobody_knows_cannot_teach_a_listener_with_events(data):
     blank = replace(dyad("blank", "listening", 0), events=None)
     with pytest.raises(ConfigError, match="blank: expected events of its listener"):
@@ -393,22 +357,26 @@ def test_windows_of_events_have_every_kind_as_often_and_come_of_the_scene_that_w
     said = {"listening": [replace(one, events=(*nods, smile, *blinks))], "speaking": [replace(other, events=blinks)]}
     corpus = gather(said, WINDOW, ARKIT, A_TOLD)
     starts = corpus.starts_by_scene(WINDOW)
-    eventful = starts_by_event(corpus, starts, WINDOW)
+    eventful = trainer.starts_by_event(corpus, starts, WINDOW)
     assert [len(eventful[scene]) for scene in said] == [2, 0]  # blinks do not count
     generator, both = torch.Generator().manual_seed(0), torch.tensor([1.0, 1.0, 0.0])
-    drawn = draw(starts, both, 400, generator, eventful, 1.0)
+    drawn = trainer.draw(starts, both, 400, generator, eventful, 1.0)
     listening = drawn < HZ * 12
     assert 0.4 < float(listening.float().mean()) < 0.6
     smiles = (drawn[listening] + WINDOW > 10 * HZ - 1).float().mean()
     assert 0.4 < float(smiles) < 0.7
-    assert float((draw(starts, both, 400, generator, eventful, 0.0) + WINDOW > 10 * HZ - 1).float().mean()) < 0.7
+    assert (
+        float((trainer.draw(starts, both, 400, generator, eventful, 0.0) + WINDOW > 10 * HZ - 1).float().mean()) < 0.7
+    )
 
 
 def test_a_group_of_channels_counts_by_its_weight_not_by_its_number():
     listener = settings(listener={"events": True}).listener
-    weights = channel_weights(listener.channels, listener.drawn_channels, config.GroupWeights(head=2.0, brows=0.5))
+    weights = trainer.channel_weights(
+        listener.channels, listener.drawn_channels, config.GroupWeights(head=2.0, brows=0.5)
+    )
     assert float(weights.sum()) == pytest.approx(1)
-    groups = [group_of(name) for name in CHANNELS]
+    groups = [trainer.group_of(name) for name in CHANNELS]
     of = {group: float(weights[[one == group for one in groups]].sum()) for group in set(groups)}
     assert of == pytest.approx({"head": 2 / 4.5, "lids": 1 / 4.5, "brows": 0.5 / 4.5, "mouth": 1 / 4.5})
     assert not weights[[name.startswith("eyeLook") for name in CHANNELS]].any()

@@ -14,14 +14,7 @@ from tiny_sfms_training import configuration
 from sfms_robot.config import parse_training
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.lab.learning.arig.features import fit_scales, gather, open_scenes
-from sfms_robot.lab.learning.arig.trainer import (
-    Student,
-    augment,
-    decayed,
-    loss_parts,
-    state_loss,
-    train_arig,
-)
+from sfms_robot.lab.learning.arig.trainer import Student, augment, decayed, loss_parts, state_loss, train_arig
 from sfms_robot.lab.learning.corpus import Corpus
 from sfms_robot.lab.learning.job import OwnNoise, Run, noise_of
 from sfms_robot.lab.learning.sfms.features import place_all
@@ -51,9 +44,13 @@ def test_a_cpu_run_is_what_it_was_before_noise_could_be_drawn_elsewhere(data, tm
     assert losses[:3] == pytest.approx([15.720572, 11.536802, 13.947612], rel=1e-4)
 
 
-def test_the_noise_of_a_cpu_is_the_runs_own():
+def test_the_noise_of_a_cpu_is_the_runs_own_and_of_weight_zero_not_drawn_on_a_gpu(data):
     generator = torch.Generator().manual_seed(1)
     assert noise_of(generator, torch.device("cpu")) is generator
+    _, _, after = step_of(data, SILENT, "cpu")
+    assert torch.equal(after, OwnNoise("cpu").manual_seed(3).get_state())
+    _, _, after = step_of(data, NOISY, "cpu")
+    assert not torch.equal(after, OwnNoise("cpu").manual_seed(3).get_state())
 
 
 def step_of(data, phase, device):
@@ -69,13 +66,6 @@ def step_of(data, phase, device):
     told, truth = augment(dyad, student.model, whole.training, noise)
     before = noise.get_state()
     return loss_parts(student, told, dyad.states, truth, whole.training, noise).total(whole.training), noise, before
-
-
-def test_noise_of_weight_zero_is_not_drawn_on_a_gpu(data):
-    _, _, after = step_of(data, SILENT, "cpu")
-    assert torch.equal(after, OwnNoise("cpu").manual_seed(3).get_state())
-    _, _, after = step_of(data, NOISY, "cpu")
-    assert not torch.equal(after, OwnNoise("cpu").manual_seed(3).get_state())
 
 
 @pytest.mark.parametrize("phase", [SILENT, NOISY, {"group_weights": {"head": 2.0}}])

@@ -81,10 +81,12 @@ def test_slow_motion_is_not_taken_for_faster_motion_nor_for_less_than_it_is():
     assert np.square(found.amplitude[0]).min() > 0.85
 
 
-def test_people_who_rest_apart_from_one_another_differ_slowly():
+def test_people_who_rest_apart_differ_slowly_and_without_rest_nothing_is_learned():
     still = [np.full((9, 50, 52), 0.5 + off, np.float32) for off in (-0.03, 0.03)]
     found = fit_idle(still, people(None))
     assert explained(found)[FROWN] > 0.02 and np.square(found.amplitude[0]).min() > 0.99
+    with pytest.raises(ValueError, match="rests"):
+        fit_idle([resting(np.zeros((20, MOTION_DIM), np.float32), ())], people(None, 1))
 
 
 def test_a_face_that_smiles_blinks_or_talks_does_not_rest():
@@ -95,8 +97,3 @@ def test_a_face_that_smiles_blinks_or_talks_does_not_rest():
     motion[12 * FRAME_HZ : 13 * FRAME_HZ, SHAPES] = 1.0
     found = resting(motion, [ListenerEvent("smile", 5.0, 1.0, 0.5), ListenerEvent("nod", 8.0, 1.0, 0.1)], said)
     assert len(found) == 7 and not found.any()
-
-
-def test_without_rest_there_is_nothing_to_learn_from():
-    with pytest.raises(ValueError, match="rests"):
-        fit_idle([resting(np.zeros((20, MOTION_DIM), np.float32), ())], people(None, 1))

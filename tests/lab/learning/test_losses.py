@@ -7,9 +7,12 @@ from sfms_robot.lab.learning.sfms.tokenizer_trainer import masking, reconstructi
 MEMBER = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
 
 
-def test_perfect_reconstruction_costs_nothing():
+def test_perfect_reconstruction_costs_nothing_and_a_steady_offset_no_velocity():
     motion = torch.randn(2, 6, 2)
     assert reconstruction(motion, motion, motion, torch.ones(2, 6, 2), MEMBER, 5.0) == 0
+    motion = torch.randn(1, 5, 2)
+    args = (motion, motion + 1, motion, torch.ones(1, 5, 2), MEMBER)
+    assert reconstruction(*args, 7.0) == pytest.approx(float(reconstruction(*args, 0.0)))
 
 
 def test_the_quantization_term_counts_keyframes_of_their_own_group_only():
@@ -21,12 +24,6 @@ def test_the_quantization_term_counts_keyframes_of_their_own_group_only():
     assert reconstruction(motion, motion, wrong, mask, MEMBER, 0.0) == 0
     mask[0, 1, 0] = 1.0
     assert reconstruction(motion, motion, wrong, mask, MEMBER, 0.0) == pytest.approx(9 / 3)
-
-
-def test_a_steady_offset_costs_no_velocity():
-    motion = torch.randn(1, 5, 2)
-    args = (motion, motion + 1, motion, torch.ones(1, 5, 2), MEMBER)
-    assert reconstruction(*args, 7.0) == pytest.approx(float(reconstruction(*args, 0.0)))
 
 
 def test_masking_is_the_distance_to_the_best_mask():

@@ -27,7 +27,7 @@ def score_network() -> ConditionalScore:
     return ConditionalScore(1, 16, 2, 1)
 
 
-def test_what_is_best_has_no_regret_and_what_cannot_be_has_infinite():
+def test_what_is_best_has_no_regret_and_following_the_teacher_ends_at_the_best_mask():
     track = tracks(bumps(4), ONE, 1)
     chosen = torch.zeros(4, 24)
     chosen[:, 3] = 1.0
@@ -35,9 +35,6 @@ def test_what_is_best_has_no_regret_and_what_cannot_be_has_infinite():
     assert regret[:, 3].isinf().all()
     assert (regret >= 0).all()
     assert (regret.amin(1) < 1e-5).all()
-
-
-def test_following_the_teacher_ends_at_the_best_mask():
     track = tracks(torch.randn(6, 24, 1).cumsum(1), ONE, 1)
     mask = torch.zeros(6, 24)
     for _ in range(5):

@@ -82,8 +82,7 @@ def settings(**phase):
 
 
 @pytest.mark.parametrize(
-    ("size", "accumulate", "said"),
-    [(3, None, "batch of 4 cannot be cut into 3 pieces"), (2, 4, "cut into 8 pieces")],
+    ("size", "accumulate", "said"), [(3, None, "batch of 4 cannot be cut into 3 pieces"), (2, 4, "cut into 8 pieces")]
 )
 def test_a_batch_that_cannot_be_shared_is_refused(data, tmp_path, size, accumulate, said):
     with pytest.raises(ConfigError, match=said):

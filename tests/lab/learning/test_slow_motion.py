@@ -20,14 +20,11 @@ def nodded() -> np.ndarray:
     return (SWAY + during * 0.05 * (1 - np.cos(2 * np.pi * 3 * since / NOD.duration_s)))[:, None].astype(np.float32)
 
 
-def test_sway_is_found_under_a_nod_and_the_nod_is_left_whole():
+def test_sway_is_found_under_a_nod_and_without_events_by_a_low_pass():
     slow = slow_part(nodded(), [NOD])[:, 0]
     assert np.abs(slow - SWAY)[50:-50].max() < 0.003
     fast = nodded()[:, 0] - slow
     assert np.ptp(fast) == pytest.approx(0.1, rel=0.06) and fast.min() > -0.004  # no swing the other way before it
-
-
-def test_without_events_it_is_a_low_pass():
     quick = np.sin(2 * np.pi * 3.0 * TIMES_S)[:, None].astype(np.float32)
     assert np.abs(slow_part(quick, [])[50:-50]).max() < 0.02
     slow = SWAY[:, None].astype(np.float32)
@@ -73,12 +70,9 @@ def test_what_channels_do_together_is_found_on_either_side_of_the_mirror(lateral
         assert float(r[0, 1]) < 0
 
 
-def test_a_border_between_dyads_is_no_motion():
+def test_a_border_between_dyads_is_no_motion_and_too_little_motion_is_refused():
     """Each dyad is fitted by itself: two heads at rest far apart do not sway."""
     amplitude, _ = sway_of([torch.zeros(200, 6), torch.ones(200, 6)])
     assert float(amplitude.max()) < 1e-4
-
-
-def test_too_little_motion_is_refused():
     with pytest.raises(ValueError, match="2 s or more"):
         sway_of([torch.zeros(10, 6)])

@@ -75,16 +75,13 @@ def dyad(name: str = "a", frames: int = 500, seed: int = 0) -> Dyad:
     return made_dyad(motion, name=name, events=tuple(events), head_of_gaze_rad=head)
 
 
-def test_without_gaze_eyes_are_still_and_the_head_has_lost_what_went_with_them():
+def test_gaze_is_taken_out_of_our_motion_alone_eyes_are_still_and_the_head_has_lost_it():
     one = without_gaze(dyad())
     assert not one.listener[:, GAZE].any() and one.head_of_gaze_rad is None
     np.testing.assert_allclose(one.listener[:, :3], dyad().listener[:, :3] - dyad().head_of_gaze_rad)
     others = [index for index in range(3, 58) if index not in GAZE]
     np.testing.assert_array_equal(one.listener[:, others], dyad().listener[:, others])
     np.testing.assert_array_equal(without_gaze(one).listener, one.listener)
-
-
-def test_gaze_is_taken_out_of_our_motion_alone():
     with pytest.raises(ConfigError, match="dyad a is in deca56: gaze can be taken out of arkit58 alone"):
         without_gaze(replace(dyad(), space="deca56", speaker=np.zeros((500, 56), np.float32),
                              listener=np.zeros((500, 56), np.float32)))  # fmt: skip
@@ -158,15 +155,12 @@ def corpus_with_sound(corpus):
     return replace(corpus, frames=replace(corpus.frames, sound=torch.zeros(n, 4, 128).half(), phase=torch.zeros(n, 21)))
 
 
-def test_windows_of_a_tokenizer_begin_with_a_keyframe():
+def test_windows_begin_with_a_keyframe_and_those_with_events_have_one_in_their_future():
     model, corpus = learner()
     fit_scales(model, corpus)
     draw = batches(model.tokenizer, model.standardise(corpus.frames.motion), corpus.lengths, 8)
     _, mask = draw(8, torch.Generator().manual_seed(0))
     assert mask.shape == (8, 48, 2) and (mask[:, 0] == 1).all() and mask.mean() < 0.5
-
-
-def test_windows_with_events_have_one_in_their_future():
     listener = settings().listener
     corpus = gather([dyad()], 48, ARKIT, None, listener)
     starts = starts_with_events(corpus, corpus.starts(48), listener)

@@ -1,12 +1,11 @@
 """Both phases on half a minute of made-up conversation."""
 
 import shutil
-import signal
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from test_training_loop import interrupt_after
 
 from sfms_robot import config
 from sfms_robot.errors import ConfigError
@@ -17,17 +16,9 @@ from sfms_robot.lab.evaluation.detection import behaviour
 from sfms_robot.lab.evaluation.rollout import rollouts
 from sfms_robot.lab.learning.corpus import windows
 from sfms_robot.lab.learning.job import Run
+from sfms_robot.lab.learning.sfms import features
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
-from sfms_robot.lab.learning.sfms.features import (
-    LEAST_SPEED,
-    SfmsCorpus,
-    fit_scales,
-    gather,
-    keyframe_tokens,
-    place_all,
-    window_tokens,
-)
 from sfms_robot.lab.learning.train_runs import calibrate
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.audio_frontend import AudioFrontend
@@ -104,14 +95,6 @@ def test_more_training_reconstructs_better(data, tmp_path):
     assert tokenizer.train_tokenizer(many, data, tmp_path)["mse"] < 0.7 * before
 
 
-def interrupt_after(step: int):
-    def watch(report):
-        if report.position.step == step:
-            signal.raise_signal(signal.SIGINT)
-
-    return watch
-
-
 def trained(phase: str, chosen: config.Training, data, out, run=Run()):  # noqa: B008
     return (tokenizer.train_tokenizer if phase == "tokenizer" else listener.train_listener)(chosen, data, out, run)
 
@@ -162,18 +145,15 @@ def test_a_listener_is_not_resumed_on_another_tokenizer_or_other_data(data, tmp_
         listener.train_listener(settings(), data, tmp_path, Run(resume=True))
 
 
-def test_the_weight_of_class_0_is_taken_out_of_its_probability():
+def test_the_weight_of_class_0_is_taken_out_of_its_probability_unless_it_is_to_stay():
     weight = settings(predictor={"steps": 1, "batch": 1, "learning_rate": 1, "transition_weight": 0.25})
     assert [g.transition_bias for g in listener.corrected(weight).groups.values()] == [1.386, 1.386]
-
-
-def _corpus() -> SfmsCorpus:
-    return gather([dyad("a"), dyad("short", 40), dyad("b", 130, seed=1)], 48, ARKIT)
-
-
-def test_the_weight_stays_where_nobody_takes_it_out():
     kept = settings(predictor={"steps": 1, "batch": 1, "learning_rate": 1e-3, "undo_weight": False})
     assert listener.corrected(kept) == kept.listener
+
+
+def _corpus() -> features.SfmsCorpus:
+    return features.gather([dyad("a"), dyad("short", 40), dyad("b", 130, seed=1)], 48, ARKIT)
 
 
 @pytest.mark.parametrize("hop", [4, 8])
@@ -181,7 +161,7 @@ def test_a_plan_that_is_drawn_as_a_whole_is_learned_as_a_whole(hop):
     """V-C: 8 frames in parallel; a shorter hop finds some of them drawn already."""
     tiny = settings()
     tiny = tiny.model_copy(update={"listener": tiny.listener.model_copy(update={"hop": hop})})
-    corpus = gather([dyad("a")], 48, ARKIT, AudioFrontend.of(tiny.listener), tiny.listener)
+    corpus = features.gather([dyad("a")], 48, ARKIT, AudioFrontend.of(tiny.listener), tiny.listener)
     model, undecided = SfmsModel(tiny.listener), []
     model.predictor.register_forward_pre_hook(lambda _, seen: undecided.append(seen[0].tokens[:, -8:] == UNDECIDED))
     listener.held_out_loss(listener.Lessons(model, corpus), tiny.predictor)
@@ -198,24 +178,18 @@ def test_windows_never_cross_from_one_dyad_into_the_next():
     assert torch.equal(windows(corpus.frames.motion, starts[-1:], 48)[0], corpus.frames.motion[-48:])
 
 
-def test_steps_from_one_dyad_into_the_next_are_no_steps():
-    """Two people who sit still in different places: nobody moves, however many dyads there are."""
-    still = [replace(dyad(name), listener=np.full((300, 58), at, np.float32)) for name, at in (("a", 0.1), ("b", 0.9))]
-    model = SfmsModel(settings().listener)
-    fit_scales(model, gather([*still] * 40, 48, ARKIT))
-    assert (model.motion_speed == LEAST_SPEED).all()
-
-
-def test_only_short_dyads_are_refused():
+def test_only_short_dyads_and_missing_data_are_one_line(tmp_path):
     with pytest.raises(ConfigError, match="none of 1 dyads can be used: 1 are shorter than a window of 48"):
-        gather([dyad("short", 40)], 48, ARKIT)
+        features.gather([dyad("short", 40)], 48, ARKIT)
+    with pytest.raises(ConfigError, match="no data set that is known here"):
+        tokenizer.train_tokenizer(settings(), tmp_path, tmp_path)
 
 
 @pytest.mark.parametrize("placement", ["exact", "static"])
 def test_keyframes_come_at_the_configured_rate_and_never_too_far_apart(placement):
     model, corpus = SfmsModel(settings(placement).listener), _corpus()
-    fit_scales(model, corpus)
-    mask = place_all(model.tokenizer, model.standardise(corpus.frames.motion), corpus.lengths)
+    features.fit_scales(model, corpus)
+    mask = features.place_all(model.tokenizer, model.standardise(corpus.frames.motion), corpus.lengths)
     assert mask.mean(0) * 48 == pytest.approx(torch.tensor([8.0, 8.0]), rel=0.1)
     for part in mask.split(corpus.lengths):
         assert (part[:, 0].nonzero()[:, 0].diff() <= 48).all()
@@ -224,11 +198,11 @@ def test_keyframes_come_at_the_configured_rate_and_never_too_far_apart(placement
 @pytest.mark.parametrize("placement", ["exact", "static"])
 def test_tokens_of_a_window_do_not_depend_on_where_in_a_dyad_it_lies(placement):
     model, corpus = SfmsModel(settings(placement).listener), _corpus()
-    fit_scales(model, corpus)
+    features.fit_scales(model, corpus)
     motion = model.standardise(corpus.frames.motion)
-    dense, starts = keyframe_tokens(model, motion), torch.arange(0, 240, 24)
-    own = window_tokens(model, motion, dense, starts)
-    assert torch.equal(own[3], window_tokens(model, motion[60:], dense[60:], starts[:1] + 12)[0])
+    dense, starts = features.keyframe_tokens(model, motion), torch.arange(0, 240, 24)
+    own = features.window_tokens(model, motion, dense, starts)
+    assert torch.equal(own[3], features.window_tokens(model, motion[60:], dense[60:], starts[:1] + 12)[0])
     assert torch.equal((own > 0).sum(1), torch.full((10, 2), 8))
     later, earlier = own[1:, :24] > 0, own[:-1, 24:] > 0
     assert torch.equal(later, earlier) == (placement == "static"), "the same frames, in another window"
@@ -251,8 +225,3 @@ def test_a_perturbed_history_moves_keyframes_by_one_level_and_nothing_else():
     before, after = (indices_to_codes((t - 1).clamp(min=0), levels)[key] for t in (tokens, moved))
     steps = (after - before).abs() / (2 / (levels - 1))
     assert (steps.sum(-1) < 1.001).all()
-
-
-def test_missing_data_is_one_line(tmp_path):
-    with pytest.raises(ConfigError, match="no data set that is known here"):
-        tokenizer.train_tokenizer(settings(), tmp_path, tmp_path)

@@ -12,7 +12,6 @@ from sfms_robot.config.listener import STATES
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.arig.modules import LongRange
 from sfms_robot.listeners.arig.stream import rotary
-from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
 ABLATIONS = [
@@ -101,25 +100,8 @@ def test_everything_that_is_told_counts(tiny, field: str):
     assert not torch.allclose(after, z)
 
 
-def test_a_batch_is_its_rows(tiny):
-    dyad = random_dyad(tiny)
-    second = ArigDyad(**{field.name: getattr(dyad, field.name)[1:] for field in dataclasses.fields(ArigDyad)})
-    with torch.no_grad():
-        torch.testing.assert_close(tiny.condition(dyad).z[1:], tiny.condition(second).z)
-
-
-def test_without_phase_it_hears_the_sound_alone():
-    model = arig_model(phase=False)
-    sound, heard, absent = torch.randn(3, model.sound_width), torch.ones(3, dtype=torch.bool), torch.zeros(16)
-    other = sound.clone()
-    other[:, -phase.FEATURES :] += 1.0
-    torch.testing.assert_close(model.embed_sound(sound, heard, absent), model.embed_sound(other, heard, absent))
-    other[:, 0] += 1.0
-    assert not torch.equal(model.embed_sound(sound, heard, absent), model.embed_sound(other, heard, absent))
-
-
 @torch.no_grad()
-def test_a_summary_sees_the_chunks_before_it_and_no_frame_of_its_own():
+def test_a_summary_sees_the_chunks_before_it_alone_and_how_far_apart_they_are_not_when():
     """Frames 0..2 are chunk 0; of it frame 4 sees the summary of frame 2 alone."""
     torch.manual_seed(0)
     long = long_range(context_layers=1, chunk_frames=3, context_chunks=2)
@@ -132,10 +114,6 @@ def test_a_summary_sees_the_chunks_before_it_and_no_frame_of_its_own():
 
     assert changed_by(1) == [frame == 1 for frame in range(9)]
     assert changed_by(2) == [frame in (2, 3, 4, 5) for frame in range(9)]  # capacity 2: this chunk and one before
-
-
-@torch.no_grad()
-def test_context_depends_on_how_far_apart_chunks_are_not_on_when():
     torch.manual_seed(0)
     long = long_range(context_layers=2, chunk_frames=1, context_chunks=4)
     past, summary = torch.randn(3, 1, 8), torch.randn(1, 8)

@@ -18,9 +18,22 @@ def rows_of(*events: ListenerEvent, frames: int = 100) -> torch.Tensor:
     return torch.from_numpy(control_track(events, 0, frames))
 
 
-def test_nothing_told_is_the_one_of_rest():
+def test_nothing_told_is_the_one_of_rest_and_events_one_upon_the_other_take_back_what_either_moves():
     found = curves.features(torch.zeros(3, len(COLUMNS)))
     assert found.shape == (3, curves.FEATURES) and bool((found[:, 0] == 1).all()) and not found[:, 1:].any()
+    smile, brow = ListenerEvent("smile", 0.2, 3.0, 0.5), ListenerEvent("brow_raise", 1.0, 1.0, 0.5)
+    moved = curves.moves(CHANNELS)
+    both, one, other = (
+        curves.remains(rows[:-1], rows[1:], moved)
+        for rows in (rows_of(*some) for some in ((smile, brow), (smile,), (brow,)))
+    )
+    torch.testing.assert_close(both, one * other)
+    model = arig_model(events=True, draws="innovation")
+    model.rest_range.fill_(0.1)
+    rows = rows_of(ListenerEvent("smile", 0.0, 2.0, 0.5), frames=2).reshape(-1)
+    made = model.drawn(torch.full((58,), 3.0), torch.zeros(58), rows, torch.tensor(False)).abs()
+    smiles = curves.moves(CHANNELS)[KINDS.index("smile")]
+    assert bool((made[smiles] > 0.1).all()) and bool((made[~smiles] <= 0.1).all())
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -89,16 +102,6 @@ def test_nothing_is_left_of_what_was_drawn_beside_an_event_once_it_is_over(
     assert bool((share[after:] == 1).all())
 
 
-def test_events_one_upon_the_other_take_back_what_either_moves():
-    smile, brow = ListenerEvent("smile", 0.2, 3.0, 0.5), ListenerEvent("brow_raise", 1.0, 1.0, 0.5)
-    moved = curves.moves(CHANNELS)
-    both, one, other = (
-        curves.remains(rows[:-1], rows[1:], moved)
-        for rows in (rows_of(*some) for some in ((smile, brow), (smile,), (brow,)))
-    )
-    torch.testing.assert_close(both, one * other)
-
-
 @settings(max_examples=10)
 @given(rho=st.floats(0.0, 0.98), off=st.floats(-9, 9), drawn=st.floats(-5, 5))
 def test_a_face_that_nothing_moves_comes_to_rest_whatever_is_drawn(rho: float, off: float, drawn: float):
@@ -116,12 +119,3 @@ def test_a_face_that_nothing_moves_comes_to_rest_whatever_is_drawn(rho: float, o
         assert float(place.abs().max()) <= max(0.5, rho**frame * abs(off)) + 1e-4
     if rho < 0.9:
         assert float(place.abs().max()) <= 0.5 + 1e-4
-
-
-def test_what_an_event_moves_is_not_held():
-    model = arig_model(events=True, draws="innovation")
-    model.rest_range.fill_(0.1)
-    rows = rows_of(ListenerEvent("smile", 0.0, 2.0, 0.5), frames=2).reshape(-1)
-    made = model.drawn(torch.full((58,), 3.0), torch.zeros(58), rows, torch.tensor(False)).abs()
-    smiles = curves.moves(CHANNELS)[KINDS.index("smile")]
-    assert bool((made[smiles] > 0.1).all()) and bool((made[~smiles] <= 0.1).all())

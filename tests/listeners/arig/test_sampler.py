@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot import config
-from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser, noise_levels, steps_of
+from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser, noise_levels
 
 
 def denoiser(**changes) -> Denoiser:
@@ -19,7 +19,7 @@ def denoiser(**changes) -> Denoiser:
 
 
 @torch.no_grad()
-def test_sampling_is_equation_4_where_nothing_is_clamped():
+def test_sampling_is_equation_4_where_nothing_is_clamped_and_ddim_keeps_the_noise_it_found():
     model = denoiser()
     z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
     alpha_bar = noise_levels(model.settings)[model.levels]
@@ -33,6 +33,17 @@ def test_sampling_is_equation_4_where_nothing_is_clamped():
         sigma = ((1 - alpha) * (1 - before) / (1 - alpha_bar[index])).sqrt()
         x = (mean + (sigma * noise[:, step + 1] if index else 0)).float()
     torch.testing.assert_close(model.sample(z, noise), x, rtol=1e-3, atol=1e-3)
+    model = denoiser(sampler="ddim")
+    z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
+    alpha_bar = noise_levels(model.settings)[model.levels].float()
+    x = noise[:, 0]
+    for index in reversed(range(5)):
+        level = model.level(torch.full((4,), model.levels[index]))
+        found = model(x, model.modulate(z, level))
+        clean = (x - (1 - alpha_bar[index]).sqrt() * found) / alpha_bar[index].sqrt()
+        before = alpha_bar[index - 1] if index else torch.tensor(1.0)
+        x = before.sqrt() * clean + (1 - before).sqrt() * found
+    torch.testing.assert_close(model.sample(z, noise), x, rtol=1e-3, atol=1e-3)
 
 
 def test_the_levels_of_noise_are_dense_where_motion_is_small_if_asked():
@@ -45,21 +56,6 @@ def test_the_levels_of_noise_are_dense_where_motion_is_small_if_asked():
     assert float(noise["logarithmic"][-1]) == pytest.approx(float(noise["cosine"][-1]))
     fine = {schedule: float((values < 0.28).double().mean()) for schedule, values in noise.items()}
     assert fine["cosine"] < 0.2 and fine["logarithmic"] > 0.4
-
-
-@torch.no_grad()
-def test_ddim_keeps_the_noise_it_found():
-    model = denoiser(sampler="ddim")
-    z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
-    alpha_bar = noise_levels(model.settings)[model.levels].float()
-    x = noise[:, 0]
-    for index in reversed(range(5)):
-        level = model.level(torch.full((4,), model.levels[index]))
-        found = model(x, model.modulate(z, level))
-        clean = (x - (1 - alpha_bar[index]).sqrt() * found) / alpha_bar[index].sqrt()
-        before = alpha_bar[index - 1] if index else torch.tensor(1.0)
-        x = before.sqrt() * clean + (1 - before).sqrt() * found
-    torch.testing.assert_close(model.sample(z, noise), x, rtol=1e-3, atol=1e-3)
 
 
 @torch.no_grad()
@@ -92,22 +88,10 @@ def test_no_sample_leaves_the_range_that_was_set(seed: int, sampler: str, steps:
     assert bool(((out >= model.low - 1e-5) & (out <= model.high + 1e-5)).all())
 
 
-@given(steps=st.integers(1, 40), sampler=st.sampled_from(["ddpm", "ddim"]))
-def test_the_last_step_returns_clean_motion(steps: int, sampler: str):
-    settings = config.Diffusion(width=12, steps=steps, train_steps=40, sampler=sampler)
-    levels = torch.linspace(0, 39, steps).round().long().tolist()
-    last = steps_of(levels, settings)[-1]
-    assert (last.motion, last.stay, last.spread) == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
-
-
 @torch.no_grad()
-def test_noise_for_another_number_of_steps_is_refused():
+def test_codes_are_drawn_by_their_probability_and_noise_for_another_number_of_steps_is_refused():
     with pytest.raises(ValueError, match="noise for 4 steps, the sampler takes 5"):
         denoiser().sample(torch.randn(1, 8), torch.randn(1, 4, 3))
-
-
-@torch.no_grad()
-def test_codes_are_drawn_by_their_probability():
     torch.manual_seed(0)
     head = CodeHead(3, 8, 8, (3, 2))
     z = torch.randn(1, 8)

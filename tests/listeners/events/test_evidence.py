@@ -9,20 +9,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.frames import FRAME_S, ListenerEvent
 from sfms_robot.lab.evaluation.whole_recordings import Scene, done_at, heard_in
-from sfms_robot.listeners.events.evidence import (
-    AT,
-    DONE,
-    EVIDENCE,
-    HEARD,
-    NUMBERS,
-    REMEMBERED_S,
-    Instant,
-    begun_before,
-    done,
-    hear,
-    hearing,
-    remembered,
-)
+from sfms_robot.listeners.events import evidence
 
 FRAMES = 600
 ASIDE = (0.2, -0.1)
@@ -45,13 +32,13 @@ def scene(seed, people=3, frames=FRAMES):
 
 
 def streamed(one):
-    state, rows = hearing(one.speaks.shape[1]), []
+    state, rows = evidence.hearing(one.speaks.shape[1]), []
     for index in range(len(one.speaks)):
-        instant = Instant(
+        instant = evidence.Instant(
             speaks=tuple(one.speaks[index].tolist()), looks=tuple(one.looks[index].tolist()),
             laughs=bool(one.laughs[index]), nods=bool(one.nods[index]), smiles=float(one.smiles[index]),
         )  # fmt: skip
-        row, state = hear(instant, state)
+        row, state = evidence.hear(instant, state)
         rows.append(row)
     return np.array(rows)
 
@@ -70,15 +57,15 @@ def test_what_comes_later_changes_nothing_before(seed, at):
 
 
 def test_a_step_leaves_what_it_was_given():
-    state = hearing()
-    first, _ = hear(Instant(speaks=(False, True), looks=(math.nan, 1.0)), state)
-    again, _ = hear(Instant(speaks=(False, True), looks=(math.nan, 1.0)), state)
-    assert state == hearing()
+    state = evidence.hearing()
+    first, _ = evidence.hear(evidence.Instant(speaks=(False, True), looks=(math.nan, 1.0)), state)
+    again, _ = evidence.hear(evidence.Instant(speaks=(False, True), looks=(math.nan, 1.0)), state)
+    assert state == evidence.hearing()
     np.testing.assert_array_equal(first, again)
 
 
 def value(rows, name, at=-1):
-    return rows[at, AT[name]]
+    return rows[at, evidence.AT[name]]
 
 
 def plain(speaks, looks=None):
@@ -113,13 +100,12 @@ def test_unknown_looks_are_no_evidence():
     blind = Scene(one.speaks, np.full_like(one.looks, np.nan), one.laughs, one.nods, one.smiles)
     rows = heard_in(blind)
     for name in ("gaze_known", "looked_at"):
-        assert not rows[:, AT[name]].any()
+        assert not rows[:, evidence.AT[name]].any()
     for name in ("looked_at_s", "looked_at_silence_s"):
-        assert np.isnan(rows[:, AT[name]]).all()
+        assert np.isnan(rows[:, evidence.AT[name]]).all()
 
 
 # --- what was done ----------------------------------------------------------------------------------------------
-
 KINDS = ("nod", "shake", "laugh", "smile", "mm_hm", "brow_raise", "blink", "tilt")
 
 
@@ -154,16 +140,16 @@ def test_done_one_by_one_equals_done_in_whole(seed):
     whole = done_at(spans, (np.arange(2500) + 1) * FRAME_S, 0.8, aside)
     for frame in range(0, 2500, 37):
         now_s = (frame + 1) * FRAME_S
-        row = done(begun_before(events, now_s), now_s, 0.8)
-        kept = done(remembered(begun_before(events, now_s), now_s), now_s, 0.8)
+        row = evidence.done(evidence.begun_before(events, now_s), now_s, 0.8)
+        kept = evidence.done(evidence.remembered(evidence.begun_before(events, now_s), now_s), now_s, 0.8)
         expected = whole[frame].copy()
-        times = [index for index, name in enumerate(DONE) if name not in NUMBERS]
+        times = [index for index, name in enumerate(evidence.DONE) if name not in evidence.NUMBERS]
         for rows in (row, kept, expected):
-            rows[times] = np.where(rows[times] > REMEMBERED_S - 2.1, np.inf, rows[times])
+            rows[times] = np.where(rows[times] > evidence.REMEMBERED_S - 2.1, np.inf, rows[times])
         np.testing.assert_allclose(row, expected, atol=1e-9)
         np.testing.assert_allclose(kept, expected, atol=1e-9)
 
 
 def test_every_column_is_named_once():
-    assert EVIDENCE == HEARD + DONE and len(set(EVIDENCE)) == len(EVIDENCE)
-    assert heard_in(scene(0)).shape == (FRAMES, len(HEARD))
+    assert evidence.EVIDENCE == evidence.HEARD + evidence.DONE and len(set(evidence.EVIDENCE)) == len(evidence.EVIDENCE)
+    assert heard_in(scene(0)).shape == (FRAMES, len(evidence.HEARD))

@@ -13,16 +13,7 @@ from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, POSE_CHANNELS, SMILE_C
 from sfms_robot.lab.evaluation.detection import Detected, added_up, asked_and_seen
 from sfms_robot.lab.evaluation.rollout import rollout
 from sfms_robot.listeners.registry import at_hop, load_listener
-from sfms_robot.listeners.sfms.draw import (
-    UNDECIDED,
-    CodeReach,
-    EventCourse,
-    anchored,
-    nod_course,
-    revoked,
-    smile_course,
-    smile_share,
-)
+from sfms_robot.listeners.sfms import draw
 from sfms_robot.listeners.sfms.quantizer import indices_to_codes
 from sfms_robot.signals.control import COLUMNS, control_track
 
@@ -35,10 +26,10 @@ FACE = [name for name in BLENDSHAPES if not name.startswith("eyeLook")]
 
 
 def told(*events, how: SmileCourse = HOW):
-    return smile_course(how, control_track(events, 0, 90)).wanted
+    return draw.smile_course(how, control_track(events, 0, 90)).wanted
 
 
-def test_a_smile_rises_to_its_size_and_is_over_when_it_is_over():
+def test_a_smile_rises_to_its_size_and_without_one_or_in_a_laugh_nothing_is_wanted():
     wanted = told(SMILE)
     times_s = (1 + np.arange(90)) * 0.04
     under_way = (times_s >= SMILE.start_s - 1e-6) & (times_s < SMILE.end_s - 1e-6)
@@ -47,14 +38,6 @@ def test_a_smile_rises_to_its_size_and_is_over_when_it_is_over():
     peak = int(shown.argmax())
     assert (np.diff(shown[: peak + 1]) >= -1e-6).all() and (np.diff(shown[peak:]) <= 1e-4).all()
     assert shown.max() == pytest.approx(SMILE.size, rel=1e-3) and shown[0] < 0.05 and shown[-1] < 0.05
-
-
-@given(st.floats(0, 12), st.floats(0, 12))
-def test_a_course_is_a_share(since_s: float, left_s: float):
-    assert 0 <= float(smile_share(HOW, np.float64(since_s), np.float64(left_s))) <= 1
-
-
-def test_without_a_smile_and_in_a_laugh_nothing_is_wanted():
     nod = ListenerEvent("nod", 0.2, 1.0, 0.1, swings=2)
     assert np.isnan(told(nod)).all() and np.isnan(told()).all()
     both = told(SMILE, LAUGH)
@@ -65,7 +48,7 @@ def test_without_a_smile_and_in_a_laugh_nothing_is_wanted():
 def test_a_code_loses_the_more_the_further_it_lies_from_the_course():
     """The transition as much as the code that is held; with none held, as one at rest."""
     wanted = np.array([np.nan, 0.5, 0.5, 0.2])
-    smiling, lost = EventCourse(HOW, 1, CODES).penalties(wanted, np.full(4, 0.1), np.array([0, 6, 0, 3]))
+    smiling, lost = draw.EventCourse(HOW, 1, CODES).penalties(wanted, np.full(4, 0.1), np.array([0, 6, 0, 3]))
     assert smiling.tolist() == [1, 2, 3] and lost.shape == (3, 12) and (lost >= 0).all()
     np.testing.assert_allclose(lost[0, 1:], (CODES - 0.5) ** 2 / 0.02, rtol=1e-5)
     np.testing.assert_allclose(lost[:, 0], [lost[0, 6], lost[1, 1], lost[2, 3]])
@@ -74,7 +57,7 @@ def test_a_code_loses_the_more_the_further_it_lies_from_the_course():
 @given(st.floats(0.2, 2), st.integers(1, 4), st.floats(0.3, 0.66), st.floats(0.03, 0.2))
 def test_a_nod_goes_to_its_size_at_each_swing_less_and_comes_back(start_s: float, swings: int, each_s: float, size):
     nod = ListenerEvent("nod", start_s, swings * each_s, size, swings)
-    course = nod_course(NODDING, control_track([nod], 0, 150))
+    course = draw.nod_course(NODDING, control_track([nod], 0, 150))
     rows = np.flatnonzero(np.isfinite(course.wanted))
     since_s = (rows + 1) * 0.04 - start_s
     assert since_s.min() > 0 and since_s.max() < nod.duration_s + 0.04
@@ -94,7 +77,7 @@ def corners(plans) -> np.ndarray:
     return np.array([plan.frames[0, at].mean() for plan in plans.values()])
 
 
-def test_a_narrow_course_is_kept_to_by_any_weights():
+def test_a_narrow_course_is_kept_to_by_any_weights_and_smiles_not_told_are_as_they_were():
     """As near as codes allow; without one untrained weights smile at nothing."""
     how = {"smile": {"spread": 0.01}, "reach": False}
     before, after = (
@@ -103,9 +86,6 @@ def test_a_narrow_course_is_kept_to_by_any_weights():
     shown = told(SMILE)[1:71]
     plateau = np.flatnonzero(shown > 0.95 * SMILE.size)
     assert np.abs(after[plateau] - SMILE.size).mean() < np.abs(before[plateau] - SMILE.size).mean()
-
-
-def test_smiles_that_are_not_told_are_as_they_were():
     plain, steered = told_listener(hop=2), told_listener(hop=2, sampling={"smile": {"spread": 0.1}})
     nod = ListenerEvent("nod", 0.8, 0.8, 0.1, swings=2)
     before, after = (plans_of(one, speech(50), events=[nod]) for one in (plain, steered))
@@ -148,14 +128,16 @@ def window(*tokens: int) -> np.ndarray:
 
 
 def now_of(tokens: np.ndarray, before: np.ndarray) -> int:
-    found = anchored(tokens, before == UNDECIDED, np.array([NOW]), RAMP)
+    found = draw.anchored(tokens, before == draw.UNDECIDED, np.array([NOW]), RAMP)
     rest = np.arange(tokens.shape[1]) != NOW
     np.testing.assert_array_equal(found[:, rest], tokens[:, rest])
     return int(found[0, NOW, 0])
 
 
-def test_what_was_held_is_a_keyframe_where_a_ramp_to_a_new_one_begins():
+def test_what_was_held_or_stands_at_the_newest_frame_is_a_keyframe_and_without_any_before_there_is_none():
     assert now_of(window(0, 7, 0, 0, 0, 0, 3, 0, 0), window(0, 7, 0, 0, 0, -1, -1, -1, -1)) == 7
+    assert now_of(window(0, 7, 0, 0, 5, 0, 3, 0, 0), window(0, 7, 0, 0, 5, -1, -1, -1, -1)) == 5
+    assert now_of(window(0, 0, 0, 0, 0, 0, 3, 0, 0), window(0, 0, 0, 0, 0, -1, -1, -1, -1)) == 0
 
 
 @pytest.mark.parametrize(
@@ -170,15 +152,10 @@ def test_where_no_ramp_begins_anew_nothing_changes(tokens, before):
     assert now_of(window(*tokens), window(*before)) == 0
 
 
-def test_a_keyframe_at_the_newest_frame_stays_and_without_any_before_there_is_none():
-    assert now_of(window(0, 7, 0, 0, 5, 0, 3, 0, 0), window(0, 7, 0, 0, 5, -1, -1, -1, -1)) == 5
-    assert now_of(window(0, 0, 0, 0, 0, 0, 3, 0, 0), window(0, 0, 0, 0, 0, -1, -1, -1, -1)) == 0
-
-
 def test_groups_and_streams_are_each_by_itself():
     tokens = np.stack([window(0, 7, 0, 0, 0, 0, 3, 0, 0)[0, :, 0], np.zeros(9, int)], axis=1)
     both = np.stack([tokens, tokens[:, ::-1]])
-    found = anchored(both, np.arange(9)[None, :, None] > NOW + 0 * both, np.array([NOW, NOW]), RAMP)
+    found = draw.anchored(both, np.arange(9)[None, :, None] > NOW + 0 * both, np.array([NOW, NOW]), RAMP)
     np.testing.assert_array_equal(found[:, NOW], [[7, 0], [0, 7]])
 
 
@@ -187,10 +164,10 @@ def test_a_ramp_begins_no_earlier_than_what_it_was_told_for():
     tokens = np.concatenate([window(0, 7, 0, 0, 0, 0, 0, 0, 3)] * 3)
     told = np.zeros((3, 9, 1), np.float32)
     told[0, NOW + 3 :] = told[1, NOW + 1 :] = 1.0
-    kept, settled = revoked(tokens, np.zeros_like(told), told, 4)
+    kept, settled = draw.revoked(tokens, np.zeros_like(told), told, 4)
     assert settled.tolist() == [NOW + 2, NOW + 1, NOW]  # the next frame is kept, whatever is told; nothing told anew
-    drawn = np.where(kept == UNDECIDED, window(0, 0, 0, 0, 0, 0, 0, 0, 3), kept)
-    found = anchored(drawn, kept == UNDECIDED, settled, RAMP)
+    drawn = np.where(kept == draw.UNDECIDED, window(0, 0, 0, 0, 0, 0, 0, 0, 3), kept)
+    found = draw.anchored(drawn, kept == draw.UNDECIDED, settled, RAMP)
     assert found[:, :, 0].tolist() == [
         [0, 7, 0, 0, 0, 0, 7, 0, 3],
         [0, 7, 0, 0, 0, 7, 0, 0, 3],
@@ -221,14 +198,16 @@ def listener_with_speed(speed: float, bounded: bool = True):
     listener.model.motion_speed.fill_(speed)
     groups = [range(6), range(6, 58)]
     codes = listener.engine.run("rest", np.zeros((1, 40, 58), np.float32), np.zeros((1, 40, 2), np.float32))[1][0]
-    return listener.model, CodeReach(codes, groups, [6, 8], listener.engine.tensors["motion_speed"], bounded)
+    return listener.model, draw.CodeReach(codes, groups, [6, 8], listener.engine.tensors["motion_speed"], bounded)
 
 
-def test_a_code_may_follow_itself_and_class_0_anything():
+def test_a_code_may_follow_itself_class_0_anything_and_without_bounds_every_code():
     _, reach = listener_with_speed(1e-6)
     for code in range(1, 7):
         allowed = ~reach.too_soon(np.array([[code, code]]), np.array([[1, 1]]))[0]
         assert allowed[:, 0].all() and allowed[:, code].all()
+    _, reach = listener_with_speed(1e-6, bounded=False)
+    assert (~reach.too_soon(np.array([[1, 1]]), np.array([[1, 1]])))[0].sum(1).tolist() == [7, 9]
 
 
 def test_allowed_codes_are_exactly_those_no_channel_has_to_hurry_for():
@@ -239,8 +218,3 @@ def test_allowed_codes_are_exactly_those_no_channel_has_to_hurry_for():
     for gap in (1, 5, 20):
         allowed = ~reach.too_soon(np.array([[3, 0]]), np.array([[gap, gap]]))[0, 0, 1:7]
         np.testing.assert_array_equal(allowed, ((neck - neck[2]).abs() <= 0.1 * gap).all(-1))
-
-
-def test_without_bounds_every_code_may_follow_at_once():
-    _, reach = listener_with_speed(1e-6, bounded=False)
-    assert (~reach.too_soon(np.array([[1, 1]]), np.array([[1, 1]])))[0].sum(1).tolist() == [7, 9]

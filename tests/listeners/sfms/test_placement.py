@@ -84,15 +84,12 @@ def test_the_temperature_acts_on_the_draw_in_one_reading_of_equation_6_alone():
     assert read[0] > 0.95 and read[1] < 0.3
 
 
-def test_adaptive_placement_takes_every_likely_frame_and_one_at_least():
+def test_adaptive_placement_takes_every_likely_frame_and_sampling_follows_the_categorical_law():
     scores = torch.tensor([[-1.0, 2.0, 3.0, -4.0], [-2.0, -1.0, -3.0, -4.0]])[..., None].requires_grad_()
     assert place_adaptive(scores)[0][..., 0].tolist() == [[0, 1, 1, 0], [0, 1, 0, 0]]
     mask, relaxed = place_adaptive(scores, 0.5, torch.Generator().manual_seed(0))
     (mask.sum() + relaxed.sum()).backward()
     assert {*mask.detach().round().unique().tolist()} <= {0.0, 1.0} and bool((scores.grad != 0).all())
-
-
-def test_sampling_frequencies_follow_the_categorical_law():
     logits = torch.log(torch.tensor([0.1, 0.2, 0.3, 0.4]))
     draws = 4000
     mask, _ = place_learned(logits[None, :, None].expand(draws, 4, 1), [1], 0.1, torch.Generator().manual_seed(0))
@@ -102,15 +99,12 @@ def test_sampling_frequencies_follow_the_categorical_law():
     assert chi_square < 16.27  # 3 degrees of freedom, p = 0.001
 
 
-def test_the_papers_static_placement_starts_at_zero_and_ours_is_centred():
+def test_the_papers_static_placement_starts_at_zero_ours_is_centred_and_gaps_stay_below_the_bound():
     motion = torch.zeros(1, 48, 3)
     paper = place_static(motion, [7, 7], centred=False)[0, :, 0].nonzero()[:, 0].tolist()
     ours = place_static(motion, [7, 7])[0, :, 0].nonzero()[:, 0].tolist()
     assert paper == [0, 6, 12, 18, 24, 30, 36]
     assert ours[0] == 47 - ours[-1]
-
-
-def test_gaps_stay_below_the_bound():
     motion = torch.zeros(1, 60, 3)
     motion[:, :5] = torch.randn(1, 5, 3)  # all that happens is at the start
     frames = place_exact(motion, [6, 6], MEMBER, max_gap=12)[0, :, 0].nonzero()[:, 0]
@@ -216,7 +210,7 @@ def test_a_learned_placement_without_its_own_scores_is_refused(strategy, wrong):
         place(torch.zeros(1, 9, 3), [2, 2], strategy, member=MEMBER, score=scores(wrong) if wrong else None)
 
 
-def test_curves_of_few_channels_hold_all_of_their_motion():
+def test_curves_of_few_channels_hold_all_of_their_motion_and_scores_know_what_is_to_come():
     motion = torch.randn(4, 20, 3)
     found = tracks(motion, torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 2)
     centred = motion - motion.mean(1, keepdim=True)
@@ -225,9 +219,6 @@ def test_curves_of_few_channels_hold_all_of_their_motion():
         own = own / own.square().sum(-1).mean(1).sqrt()[:, None, None]
         curves = found.curves.view(4, 2, 20, 2)[:, group]
         torch.testing.assert_close(curves @ curves.transpose(1, 2), own @ own.transpose(1, 2), rtol=1e-4, atol=1e-4)
-
-
-def test_scores_know_how_many_keyframes_are_to_come():
     score = ConditionalScore(1, 8, 2, 1)
     track = tracks(torch.randn(1, 12, 1).cumsum(1), torch.ones(1, 1), 1)
     told = [score(track, torch.zeros(1, 12), torch.tensor([k])) for k in (0, 1, 5)]
@@ -235,7 +226,6 @@ def test_scores_know_how_many_keyframes_are_to_come():
 
 
 # --- As many as pay for themselves ---
-
 COST = st.floats(0.02, 20)
 
 
@@ -287,14 +277,11 @@ def test_before_a_keyframe_that_two_motions_share_only_what_is_there_decides(see
         assert torch.equal(a[: shared.max()], b[: shared.max()])
 
 
-def test_a_dyads_keyframes_do_not_depend_on_the_rest_of_the_batch():
+def test_a_dyads_keyframes_do_not_depend_on_the_batch_and_one_that_costs_nothing_is_refused():
     motion = walk3(3, 50, 3)
     together = place_penalised(motion, [0.5, 0.5], MEMBER, 30, 5)
     for row in range(3):
         assert torch.equal(place_penalised(motion[row : row + 1], [0.5, 0.5], MEMBER, 30, 5)[0], together[row])
-
-
-def test_a_keyframe_that_costs_nothing_is_refused():
     with pytest.raises(ValueError, match="not all above 0"):
         place_penalised(torch.zeros(1, 9, 3), [1.0, 0.0], MEMBER)
 

@@ -34,13 +34,10 @@ def test_a_frame_knows_the_keyframes_before_it_and_none_behind(tiny, changed: in
     assert not torch.equal(a[:, changed + 1], b[:, changed + 1])
 
 
-def test_a_parallel_predictor_answers_all_frames_alone():
+def test_a_parallel_predictor_answers_all_frames_alone_and_what_is_drawn_already_changes_what_follows(tiny):
     predictor = tiny_listener(sequential=False).model.predictor
     a, b = (logits(predictor, context(), torch.full((1, 8, 2), token)) for token in (0, 4))
     assert torch.equal(a, b)
-
-
-def test_what_is_drawn_already_changes_what_follows(tiny):
     a, b = (logits(tiny.model.predictor, context(drawn)) for drawn in (0, 4))
     assert not torch.equal(a, b)
 
@@ -58,7 +55,7 @@ def test_what_is_marked_missing_does_not_matter(modality: str, sequential: bool)
     assert torch.equal(logits(predictor, one), logits(predictor, other))
 
 
-def test_many_answers_to_one_speaker_are_those_to_copies_of_him(tiny):
+def test_many_answers_are_those_to_copies_of_the_speaker_and_every_weight_has_a_gradient(tiny):
     one, copies = context(), context()
     own = torch.cat([one.tokens, one.tokens.flip(1).clamp(min=0)])
     names = ("face", "face_known", "voice", "heard", "phase")
@@ -66,9 +63,6 @@ def test_many_answers_to_one_speaker_are_those_to_copies_of_him(tiny):
     copies = Context(**both, tokens=own, control=one.control.expand(2, -1, -1))
     with torch.no_grad():
         torch.testing.assert_close(tiny.model.predictor(one._replace(tokens=own)), tiny.model.predictor(copies))
-
-
-def test_every_weight_has_a_gradient(tiny):
     predictor = tiny_listener().model.predictor
     seen = context(voice=predictor.speaker.listen(torch.randn(1, 41 * 4, 128)), face_known=torch.rand(1, 40) > 0.5)
     seen = seen._replace(heard=torch.rand(1, 40) > 0.5, tokens=context(3).tokens)

@@ -48,14 +48,11 @@ def book(sizes=(5, 3), dims: int = 2) -> Codebook:
     return Codebook(list(sizes), dims)
 
 
-def test_every_vector_is_the_nearest_to_itself_and_absent_ones_are_never_chosen():
+def test_every_vector_is_the_nearest_to_itself_and_passes_its_gradient_to_the_encoder_alone():
     codebook = book()
     indices = torch.stack([torch.arange(5), torch.arange(5) % 3], dim=-1)
     assert torch.equal(codebook.indices(codebook.codes(indices)), indices)
     assert codebook.indices(torch.randn(1, 200, 2, 2) * 9)[..., 1].max() < 3
-
-
-def test_a_vector_code_passes_its_gradient_to_the_encoder_alone():
     codebook = book()
     latent = torch.randn(1, 4, 2, 2, requires_grad=True)
     code = codebook.nearest(latent)
@@ -75,7 +72,7 @@ def test_commitment_is_the_distance_to_the_vectors_at_keyframes_only():
     assert (latent.grad[0, 1] == 0).all() and latent.grad[0, 0, 0, 0] > 0
 
 
-def test_vectors_settle_at_the_means_of_the_keyframes_they_stand_for():
+def test_vectors_settle_at_the_means_of_their_keyframes_and_idle_ones_begin_anew():
     codebook, drawn = book((2,), 1), torch.Generator().manual_seed(0)
     mask = torch.ones(1, 40, 1)
     for _ in range(600):
@@ -83,9 +80,6 @@ def test_vectors_settle_at_the_means_of_the_keyframes_they_stand_for():
         codebook.learn(torch.where(torch.arange(40)[None, :, None, None] < 20, -2.0, 3.0) + noise, mask, drawn)
     found = sorted(codebook.vectors[0, :, 0].tolist())
     assert found == pytest.approx([-2.0, 3.0], abs=0.05)
-
-
-def test_idle_vectors_begin_anew_at_keyframes():
     codebook, drawn = book((8,), 1), torch.Generator().manual_seed(0)
     codebook.vectors.fill_(100.0)
     latent = torch.rand(1, 400, 1, 1, generator=drawn)

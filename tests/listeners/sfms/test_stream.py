@@ -74,7 +74,7 @@ def test_the_default_hop_is_the_largest_that_leaves_time_for_step_and_lead(horiz
         assert hop * FRAME_S + STEP_S + LEAD_S <= (horizon - 1) * FRAME_S < (hop + 1) * FRAME_S + STEP_S + LEAD_S
 
 
-def test_smoothing_rounds_the_corners_of_the_head_and_leaves_steady_motion_and_the_face():
+def test_smoothing_rounds_the_corners_of_the_head_alone_and_a_plan_goes_on_in_place_and_speed():
     soft = tiny_listener(sampling={"smoothing": 0.5})
     steady = np.tile(np.arange(10, dtype=np.float32)[:, None], 58)
     np.testing.assert_allclose(soft.shown(steady), steady[2:], rtol=1e-6)
@@ -84,9 +84,6 @@ def test_smoothing_rounds_the_corners_of_the_head_and_leaves_steady_motion_and_t
     np.testing.assert_array_equal(shown[:, 6:], corner[2:, 6:])
     assert np.abs(np.diff(shown[:, 0], 2)).max() <= 0.5 * np.abs(np.diff(corner[:, 0], 2)).max()
     np.testing.assert_array_equal(tiny_listener().shown(corner), corner[2:])
-
-
-def test_a_plan_goes_on_in_place_and_speed():
     tail = np.array([[0.0], [1.0]], np.float32)
     decoded = np.full((10, 1), 5.0, np.float32)
     path = join(tail, decoded, seam=4)[:, 0]

@@ -75,7 +75,7 @@ def test_what_is_told_again_as_it_was_calls_nothing_off(told):
         last = memory.tokens if plan is not None else last
 
 
-def test_tokens_are_revoked_from_the_first_future_frame_that_is_told_otherwise():
+def test_tokens_are_revoked_where_told_otherwise_and_the_last_keyframe_is_held_at_the_edge():
     tokens = np.ones((2, 48, 3), np.int64)
     before = np.zeros((2, 48, len(COLUMNS)), np.float32)
     told = before.copy()
@@ -86,9 +86,6 @@ def test_tokens_are_revoked_from_the_first_future_frame_that_is_told_otherwise()
     assert settled.tolist() == [42, 40]
     assert (after[0, 43:] == UNDECIDED).all() and (after[0, :43] == 1).all()
     assert (after[1, 40 + KEPT_FRAMES :] == UNDECIDED).all() and (after[1, : 40 + KEPT_FRAMES] == 1).all()
-
-
-def test_the_last_keyframe_that_leaves_the_window_is_held_at_its_edge():
     tokens, path = np.zeros((1, 48, 2), np.int64), np.zeros((1, 10, 4), np.float32)
     tokens[0, 1, 0], tokens[0, 20, 1] = 5, 3
     for step in (1, 2, 3):
@@ -99,13 +96,10 @@ def test_the_last_keyframe_that_leaves_the_window_is_held_at_its_edge():
     assert onto_one[0, 0].tolist() == [5, 3]
 
 
-def test_gaze_is_left_to_kinematics(told):
+def test_gaze_is_left_to_kinematics_and_each_stream_sways_from_rest_its_own_way(told):
     for plan in plans_of(told, speech(30), events=[NOD]).values():
         assert (plan.frames[:, GAZE] == 0).all()
         assert np.abs(plan.frames[:, :6]).max() > 0
-
-
-def test_the_head_sways_from_rest_and_each_stream_its_own_way(told):
     one, other = plans_of(told, speech(90), seed=1), plans_of(told, speech(90), seed=2)
     assert not np.array_equal(one[80].frames[:, :6], other[80].frames[:, :6])
     nothing = np.zeros((1, 90, 58), np.float32)

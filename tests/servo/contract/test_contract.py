@@ -36,19 +36,13 @@ def near(angles_rad, rig):
     return pytest.approx(angles_rad, abs=slack_rad)
 
 
-def test_joints_are_in_the_order_of_the_servos(rig):
+def test_joints_are_in_the_order_of_the_servos_nothing_goes_before_connect_and_no_goal_before_enable(rig):
     assert list(rig.bus.joints) == [f"joint{i}" for i in rig.ids]
     assert set(rig.bus.capabilities) == set(rig.bus.joints)
-
-
-def test_nothing_goes_before_connect(rig):
     with pytest.raises(BusError, match="not connected"):
         rig.bus.poll(rig.now_s)
     with pytest.raises((BusError, ValueError)):
         rig.bus.write(np.zeros(len(rig.ids)), rig.now_s)
-
-
-def test_goals_are_refused_before_enable(rig):
     rig.bus.connect()
     rig.bus.poll(rig.now_s)
     mark = len(rig.sent)
@@ -93,7 +87,7 @@ def test_goal_is_reached(rig):
         assert rig.shafts_rad() == near(goals, rig)
 
 
-def test_nothing_is_reported_that_the_family_does_not_tell(rig):
+def test_nothing_is_reported_that_the_family_does_not_tell_and_statistics_have_the_keys_of_the_report(rig):
     held = rig.hold()
     readings = rig.ticks(held, 40)
     for joint, reading in readings.items():
@@ -101,10 +95,6 @@ def test_nothing_is_reported_that_the_family_does_not_tell(rig):
         assert (reading.position_rad is None) == ("position" not in told)
         assert math.isinf(reading.age_s) == ("position" not in told)
         assert {TOLD[key] for key in reading.extra} <= told
-
-
-def test_statistics_have_the_keys_of_the_report(rig):
-    held = rig.hold()
     rig.ticks(held, 3)
     counts = rig.bus.statistics()
     assert set(counts) >= STATISTICS
@@ -406,7 +396,6 @@ def test_bytes_on_the_wire_are_those_that_are_counted(rig, request, count):
 
 
 # --- what servos have stored ------------------------------------------------------------------------------------
-
 REFUSED, WARNED, SET = "refused", "warned", "set"
 STORED = [  # family, register, value, what a start makes of it
     ("dynamixel2", "drive_mode", 1, REFUSED),
@@ -494,8 +483,6 @@ def test_a_servo_that_comes_back_with_less_protection_is_one_more_warning(name, 
 
 
 # --- torque that is not confirmed off ---------------------------------------------------------------------------
-
-
 def unconfirmed(rig):
     return rig.bus.statistics()["torque_unconfirmed"]
 
