@@ -38,6 +38,7 @@ from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
+from sfms_robot.lab.corpora.compose.motions import pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
@@ -260,14 +261,14 @@ def cast(voices: Sequence[VoiceClip], rng: np.random.Generator) -> VoiceClip:
     """Draw a voice, often one whose mouth was filmed."""
     filmed = rng.random() < _FILMED
     fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
-    return fitting[int(rng.integers(len(fitting)))]
+    return pick(fitting, rng)
 
 
 def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: np.random.Generator) -> VoiceClip | None:
     """Draw a filmed voice for the listener, if possible not the speaker's; None: none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     fitting = [voice for voice in filmed if voice.name != other.name] or filmed
-    return fitting[int(rng.integers(len(fitting)))] if fitting else None
+    return pick(fitting, rng) if fitting else None
 
 
 # --- which stretches --------------------------------------------------------------------------------------------

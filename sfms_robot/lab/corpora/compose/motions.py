@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from scipy import signal
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, SMILE_CORNERS, Floats, ListenerEvent
+
+_Piece = TypeVar("_Piece")
 
 SHAPE: Final = {name: index for index, name in enumerate(BLENDSHAPES)}
 
@@ -88,7 +90,7 @@ def laid_event(kind: str, start_s: float, curve: Floats, size: float) -> Listene
     return ListenerEvent(kind, first_frame(start_s) * FRAME_S, len(curve) * FRAME_S, float(size))
 
 
-def pick(pieces: Sequence[Floats], rng: np.random.Generator) -> Floats:
+def pick(pieces: Sequence[_Piece], rng: np.random.Generator) -> _Piece:
     return pieces[int(rng.integers(len(pieces)))]
 
 
