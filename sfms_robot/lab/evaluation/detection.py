@@ -285,7 +285,7 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
         counts += phrase_timing.phrase_end_counts(
             starts, phrase_timing.phrase_ends(spoke, FRAME_HZ), dyad.listening, FRAME_HZ
         )
-    minutes = sum(len(motion) / FRAME_HZ / 60 for motion in motions)
+    minutes = sum(map(len, motions)) / FRAME_HZ / 60
     still = []
     for motion in motions:
         if seconds := len(motion) // FRAME_HZ:
@@ -293,10 +293,10 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
             still.append((np.ptp(turns, axis=1).max(axis=1) < _STILL_DEG).mean())
     return {
         "nods": onsets / listened if listened else np.nan,
-        "nod_deg": float(np.degrees(middle(sizes))),
+        "nod_deg": middle(np.degrees(sizes)),
         "phrase_end_ratio": phrase_timing.ratio_of(counts.tolist()),
-        "blinks": len(_spans(motions, "eyeBlinkLeft", events.find_blinks)) / minutes,
-        "smiles": len(_spans(motions, "mouthSmileLeft", events.find_smiles)) / minutes,
+        "blinks": len(_lasted_s(motions, "eyeBlinkLeft", events.find_blinks)) / minutes,
+        "smiles": len(_lasted_s(motions, "mouthSmileLeft", events.find_smiles)) / minutes,
         "still_share": float(np.mean(still or np.nan)),
         "speed_deg_s": _fastest(motions, 1),
         "acceleration_deg_s2": _fastest(motions, 2),
@@ -309,8 +309,10 @@ def middle(values: Sequence[float] | Doubles) -> float:
     return float(np.median(values)) if len(values) else np.nan
 
 
-def _spans(motions: Sequence[Floats], channel: str, find: FindEvents) -> list[events.Event]:
-    return [event for motion in motions for event in find(motion[:, CHANNEL_INDEX[channel]], FRAME_HZ)]
+def _lasted_s(motions: Sequence[Floats], channel: str, find: FindEvents) -> list[float]:
+    """Return how long each event lasts that is found in a channel."""
+    every = (event for motion in motions for event in find(motion[:, CHANNEL_INDEX[channel]], FRAME_HZ))
+    return [end - start for start, end, _ in every]
 
 
 def _fastest(motions: Sequence[Floats], order: int) -> float:
@@ -340,8 +342,8 @@ def movement(motions: Sequence[Floats], addressed: Sequence[events.Bools]) -> di
         "nod_s": middle(lengths),
         "nod_cycle_s": middle(cycles),
         "nod_swings": middle(swings),
-        "blink_s": middle([end - start for start, end, _ in _spans(motions, "eyeBlinkLeft", events.find_blinks)]),
-        "smile_s": middle([end - start for start, end, _ in _spans(motions, "mouthSmileLeft", events.find_smiles)]),
+        "blink_s": middle(_lasted_s(motions, "eyeBlinkLeft", events.find_blinks)),
+        "smile_s": middle(_lasted_s(motions, "mouthSmileLeft", events.find_smiles)),
         "look_s": middle(sum(map(looks_s, gazes), [])),
         "gaze_on_person": float(on_person.mean()) if len(on_person) else np.nan,
         "gaze_shifts_per_minute": sum(map(shifts, gazes)) / minutes if minutes else np.nan,
