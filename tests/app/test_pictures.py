@@ -39,7 +39,7 @@ def run_with_events():
         frames[:, CHANNEL_INDEX[name]] += height * np.exp(-(((times_s - at_s) / width_s) ** 2))
 
     bump("pitch", 4.0, 0.2, 0.15)
-    bump("pitch", 14.0, 0.1, 0.15)
+    bump("pitch", 14.0, -0.3, 0.15)  # a look up
     for side in ("Left", "Right"):
         bump(f"eyeBlink{side}", 7.0, 1.0, 0.08)
         bump(f"mouthSmile{side}", 11.0, 0.8, 0.8)

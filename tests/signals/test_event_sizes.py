@@ -12,9 +12,7 @@ from sfms_robot.signals.motion_primitives import read_motions
 def test_looks_aside_are_peoples_as_often_to_either_side_and_as_far_as_asked():
     shares = np.random.default_rng(0).random(4000)
     assert np.mean([sizes.aside_s(share) for share in shares]) == pytest.approx(sizes.ASIDE_MEAN_S, rel=0.05)
-    assert np.degrees(np.median([sizes.aside_rad(share) for share in shares])) == pytest.approx(
-        sizes.ASIDE_DEG[1][2], rel=0.05
-    )
+    assert np.degrees(np.median([*map(sizes.aside_rad, shares)])) == pytest.approx(sizes.ASIDE_DEG[1][2], rel=0.05)
     rng = np.random.default_rng(1)
     found = np.array([sizes.aside(0.2, *rng.random(2)) for _ in range(4000)])
     np.testing.assert_allclose(np.hypot(*found.T), 0.2)

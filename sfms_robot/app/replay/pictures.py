@@ -268,12 +268,16 @@ def _signal(motion: Floats, name: str) -> Floats:
 
 
 def _nods(times_s: Doubles, motion: Floats) -> list[tuple[int, int, int]]:
-    """Return the rows at which nods begin, are lowest and end."""
+    """Return the rows at which nods begin, are lowest and end; a head that goes up and comes back looks up."""
     if len(times_s) < 2:
         return []
     pitch, rate_hz = motion[:, CHANNEL_INDEX["pitch"]], 1.0 / float(np.median(np.diff(times_s)))
     ends = [(round(start_s * rate_hz), round(end_s * rate_hz)) for start_s, end_s, _ in find_nods(pitch, rate_hz)]
-    return [(begin, begin + int(np.argmax(pitch[begin : end + 1])), end) for begin, end in ends]
+    return [
+        (begin, low, end)
+        for begin, end in ends
+        if begin < (low := begin + int(np.argmax(pitch[begin : end + 1]))) < end
+    ]
 
 
 def _peaks(signals: dict[str, Floats]) -> list[int]:

@@ -167,9 +167,8 @@ def rows_of(
 
         trainings = len(made) // count
         draws[name] = bootstrap(score, [*people] * trainings, np.repeat(range(trainings), count).tolist())
-        found = {key: [round(end, 5) for end in ends] for key, ends in intervals(draws[name]).items()}
         all_clips = row(name, "here", score(np.arange(len(made))))
-        rows.append({**all_clips, "trainings": trainings, "interval": found})
+        rows.append({**all_clips, "trainings": trainings, "interval": intervals(draws[name])})
     if number == 2:
         paper_rows = [row(name, "paper", dict(zip(_NAMES, each, strict=True))) for name, each in _PAPER_2.items()]
         return rows + paper_rows, []
@@ -205,7 +204,7 @@ def claims(
                 found.append({
                     "name": name, "figure": f"{metric} {part}",
                     "with all parts better by": round(float(np.mean(whole - less)), 5),
-                    "interval": interval and [round(end, 5) for end in interval],
+                    "interval": interval,
                     "verdict": verdict(interval, comparable=comparable),
                 })  # fmt: skip
     return found

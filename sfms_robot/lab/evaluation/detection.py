@@ -63,24 +63,24 @@ class Sightings:
     @property
     def recall(self) -> float:
         """Return the share of requested events seen in time; NaN of none."""
-        return float(self.in_time.mean()) if len(self.in_time) else float("nan")
+        return float(self.in_time.mean()) if len(self.in_time) else np.nan
 
     @property
     def precision(self) -> float:
         """Return the share of seen events that were requested, in time; NaN of none."""
-        return float(self.in_time.sum() / self.seen) if self.seen else float("nan")
+        return float(self.in_time.sum() / self.seen) if self.seen else np.nan
 
     @property
     def offset_s(self) -> float:
         """Return the median lateness; NaN of none."""
-        return float(np.median(self.late_s)) if len(self.late_s) else float("nan")
+        return middle(self.late_s)
 
     def recall_at(self, sizes: Doubles, edges: Sequence[float]) -> float:
         """Return the recall that events of these sizes would have, by the recall of each range between `edges`."""
         here, there = np.digitize(self.sizes, edges), np.digitize(sizes, edges)
         known = {place: self.in_time[here == place].mean() for place in np.unique(here)}
         found = [known[place] for place in there if place in known]
-        return float(np.mean(found)) if found else float("nan")
+        return float(np.mean(found)) if found else np.nan
 
     def report(self, kind: str) -> dict[str, Any]:
         """Return counts, recall, precision and lateness, and the recall by size; None where undefined."""
@@ -92,12 +92,11 @@ class Sightings:
             **self.figures(self.recall),
             "by_size": [
                 {
-                    "size": [round(float(edges[at - 1]), 4), round(float(edges[at]), 4)],
+                    "size": np.round(edges[at - 1 : at + 1], 4).tolist(),
                     "asked": int((place == at).sum()),
                     "recall": round(float(self.in_time[place == at].mean()), 4),
                 }
-                for at in range(1, len(edges))
-                if (place == at).any()
+                for at in np.unique(place).tolist()
             ],
         }
 
@@ -107,22 +106,22 @@ class Sightings:
 
 
 def seen(motion: Floats, kind: str) -> list[tuple[float, float, float]]:
-    """Return (start_s, end_s, size) of the events of a kind (`MOTION_EVENTS`) in motion (N, 58).
-
-    The head goes along with a look aside and comes back, which is not a nod: the head's part of looking is removed, if
-    the eyes move at all (untracked eyes do not).
-    """
+    """Return (start_s, end_s, size) of the events of a kind (`MOTION_EVENTS`) in motion (N, 58)."""
     how = MOTION_EVENTS[kind]
-    if kind != "nod" or not motion[:, _EYES].any():
-        return how.find(how.signal(motion), FRAME_HZ)
-    rows = np.array(motion, np.float64)
-    rows[:, :3] -= head_part(gaze_rad(motion))
-    return how.find(how.signal(rows), FRAME_HZ)
+    return how.find(_pitch(motion) if kind == "nod" else how.signal(motion), FRAME_HZ)
+
+
+def _pitch(motion: Floats) -> Doubles:
+    """Return the pitch (N,) of motion (N, 58) but for the head's part of looking, if the eyes move at all (untracked
+    eyes do not): the head goes along with a look aside and comes back, which is not a nod.
+    """
+    pitch = motion[:, CHANNEL_INDEX["pitch"]].astype(float)
+    return pitch - head_part(gaze_rad(motion))[:, 1] if motion[:, _EYES].any() else pitch
 
 
 def gaze_rad(motion: Floats) -> Doubles:
     """Return the direction (N, 2), yaw and pitch, in which head and eyes of motion (N, 58) look together."""
-    return np.asarray(motion[:, YAW_PITCH] + directions(motion, _EYES_RAD).mean(axis=1), np.float64)
+    return np.asarray(motion[:, YAW_PITCH] + directions(motion, _EYES_RAD).mean(axis=1), float)
 
 
 @dataclass(frozen=True)
@@ -159,7 +158,7 @@ def asked_and_seen(
         pairs = paired(np.array([event.start_s for event in wanted]) + lag, starts_s, _LOOSE_S)
         in_time = np.zeros(len(wanted))
         in_time[[place for place, late in pairs if abs(late) <= _IN_TIME_S + 1e-9]] = 1.0
-        sizes = np.array([abs(event.size) for event in wanted], np.float64)
+        sizes = np.array([abs(event.size) for event in wanted], float)
         late_s = np.array([late for _, late in pairs]) + lag
         found[kind] = Sightings(sizes, in_time, int((starts_s < last_s).sum()), late_s)
     return found
@@ -181,11 +180,8 @@ def paired(asked_s: Doubles, seen_s: Doubles, within_s: float) -> list[tuple[int
 
 def added_up(parts: Iterable[Mapping[str, Sightings]]) -> dict[str, Sightings]:
     """Return the sum of each kind."""
-    total: dict[str, Sightings] = {kind: Sightings() for kind in MOTION_EVENTS}
-    for part in parts:
-        for kind, one in part.items():
-            total[kind] = total[kind] + one
-    return total
+    every = list(parts)
+    return {kind: sum((part[kind] for part in every if kind in part), Sightings()) for kind in MOTION_EVENTS}
 
 
 @dataclass(frozen=True)
@@ -266,6 +262,7 @@ _ON_PERSON_RAD: Final = np.deg2rad(5.0)
 _FIXATION_RAD: Final = np.deg2rad(2.0)  # a look ends when gaze is that far from where it began
 _SHIFT_RAD: Final = np.deg2rad(5.0)
 _SWAY_WINDOW: Final = 20 * FRAME_HZ
+_CYCLE: Final = 0.25  # of the depth of a nod: less between two peaks does not part them
 _SLOW: Final = 10 * FRAME_HZ  # frames whose median is a slow pose
 FindEvents = Callable[[Floats, float], Sequence[events.Event]]
 
@@ -288,19 +285,19 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
         counts += phrase_timing.phrase_end_counts(
             starts, phrase_timing.phrase_ends(spoke, FRAME_HZ), dyad.listening, FRAME_HZ
         )
-    minutes = sum(len(motion) / FRAME_HZ / 60 for motion in motions)
+    minutes = sum(map(len, motions)) / FRAME_HZ / 60
     still = []
     for motion in motions:
         if seconds := len(motion) // FRAME_HZ:
             turns = np.degrees(motion[: seconds * FRAME_HZ, _ROTATIONS]).reshape(seconds, FRAME_HZ, 3)
             still.append((np.ptp(turns, axis=1).max(axis=1) < _STILL_DEG).mean())
     return {
-        "nods": onsets / listened if listened else float("nan"),
-        "nod_deg": float(np.degrees(middle(sizes))),
+        "nods": onsets / listened if listened else np.nan,
+        "nod_deg": middle(np.degrees(sizes)),
         "phrase_end_ratio": phrase_timing.ratio_of(counts.tolist()),
-        "blinks": len(_spans(motions, "eyeBlinkLeft", events.find_blinks)) / minutes,
-        "smiles": len(_spans(motions, "mouthSmileLeft", events.find_smiles)) / minutes,
-        "still_share": float(np.mean(still)) if still else float("nan"),
+        "blinks": len(_lasted_s(motions, "eyeBlinkLeft", events.find_blinks)) / minutes,
+        "smiles": len(_lasted_s(motions, "mouthSmileLeft", events.find_smiles)) / minutes,
+        "still_share": float(np.mean(still or np.nan)),
         "speed_deg_s": _fastest(motions, 1),
         "acceleration_deg_s2": _fastest(motions, 2),
         "jerk_deg_s3": _fastest(motions, 3),
@@ -309,17 +306,19 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
 
 def middle(values: Sequence[float] | Doubles) -> float:
     """Return the median; NaN of no values."""
-    return float(np.median(values)) if len(values) else float("nan")
+    return float(np.median(values)) if len(values) else np.nan
 
 
-def _spans(motions: Sequence[Floats], channel: str, find: FindEvents) -> list[events.Event]:
-    return [event for motion in motions for event in find(motion[:, CHANNEL_INDEX[channel]], FRAME_HZ)]
+def _lasted_s(motions: Sequence[Floats], channel: str, find: FindEvents) -> list[float]:
+    """Return how long each event lasts that is found in a channel."""
+    every = (event for motion in motions for event in find(motion[:, CHANNEL_INDEX[channel]], FRAME_HZ))
+    return [end - start for start, end, _ in every]
 
 
 def _fastest(motions: Sequence[Floats], order: int) -> float:
-    values = [np.linalg.norm(np.diff(motion[:, _ROTATIONS].astype(float), order, axis=0), axis=1) for motion in motions]
-    pooled = np.concatenate(values)
-    return float(np.degrees(np.percentile(pooled, 99.9)) * FRAME_HZ**order) if len(pooled) else float("nan")
+    moved = [np.diff(motion[:, _ROTATIONS].astype(float), order, axis=0) for motion in motions]
+    pooled = np.linalg.norm(np.concatenate(moved), axis=1)
+    return float(np.degrees(np.percentile(pooled, 99.9)) * FRAME_HZ**order) if len(pooled) else np.nan
 
 
 # --- how a face moves -----------------------------------------------------------------------------------------------
@@ -328,11 +327,11 @@ def _fastest(motions: Sequence[Floats], order: int) -> float:
 def movement(motions: Sequence[Floats], addressed: Sequence[Bools]) -> dict[str, float]:
     """Return figures of motions (N, 58), each with the frames (N,) in which gaze at the person is expected.
 
-    Medians of nods (size, length, swings), of the lengths of blinks, smiles and looks, gaze within 5 degrees of the
-    person (share of the expected time), gaze shifts of 5 degrees and more per minute, and power of the head's turns by
-    band of `SWAY_BANDS_HZ`. NaN where nothing was found.
+    Medians of nods (as in `nods_of`), of the lengths of blinks, smiles and looks, gaze within 5 degrees of the person
+    (share of the expected time), gaze shifts of 5 degrees and more per minute, and power of the head's turns by band of
+    `SWAY_BANDS_HZ`. NaN where nothing was found.
     """
-    sizes, lengths, swings = nods_of(motions).T
+    sizes, lengths, cycles, swings = nods_of(motions).T
     gazes = [gaze_rad(motion) for motion in motions]
     minutes = sum(map(len, motions)) / FRAME_HZ / 60
     on_person = np.concatenate(
@@ -341,12 +340,13 @@ def movement(motions: Sequence[Floats], addressed: Sequence[Bools]) -> dict[str,
     return {
         "nod_deg": middle(np.degrees(sizes)),
         "nod_s": middle(lengths),
+        "nod_cycle_s": middle(cycles),
         "nod_swings": middle(swings),
-        "blink_s": middle([end - start for start, end, _ in _spans(motions, "eyeBlinkLeft", events.find_blinks)]),
-        "smile_s": middle([end - start for start, end, _ in _spans(motions, "mouthSmileLeft", events.find_smiles)]),
-        "look_s": middle([length for gaze in gazes for length in looks_s(gaze)]),
-        "gaze_on_person": float(on_person.mean()) if len(on_person) else float("nan"),
-        "gaze_shifts_per_minute": sum(map(shifts, gazes)) / minutes if minutes else float("nan"),
+        "blink_s": middle(_lasted_s(motions, "eyeBlinkLeft", events.find_blinks)),
+        "smile_s": middle(_lasted_s(motions, "mouthSmileLeft", events.find_smiles)),
+        "look_s": middle(sum(map(looks_s, gazes), [])),
+        "gaze_on_person": float(on_person.mean()) if len(on_person) else np.nan,
+        "gaze_shifts_per_minute": sum(map(shifts, gazes)) / minutes if minutes else np.nan,
         **{
             f"sway_db_{low:g}_{high:g}_hz": power
             for (low, high), power in zip(SWAY_BANDS_HZ, sway_db(motions).tolist(), strict=True)
@@ -355,19 +355,26 @@ def movement(motions: Sequence[Floats], addressed: Sequence[Bools]) -> dict[str,
 
 
 def nods_of(motions: Sequence[Floats]) -> Doubles:
-    """Return (K, 3): size peak to peak [rad], length [s], and swings down and back of each nod."""
-    nods = [
-        (size, end - start, _swings(motion, start, end))
-        for motion in motions
-        for start, end, size in seen(motion, "nod")
-    ]
-    return np.array(nods, np.float64).reshape(-1, 3)
+    """Return (K, 4): size peak to peak [rad], length [s], length of a cycle [s], and number of cycles of each nod.
 
+    The length of a nod is its full width at half depth, in recorded and in drawn motion alike: from where the pitch
+    passes half the depth of the first cycle to where it comes back to half the depth of the last. Depths count from the
+    line between the pitch before and after the nod. The length of a cycle is its own full width at half depth, the
+    median of all. Two lowest points with less than a quarter of the depth between them are one cycle.
 
-def _swings(motion: Floats, start_s: float, end_s: float) -> float:
-    pitch = motion[int(start_s * FRAME_HZ) : int(end_s * FRAME_HZ) + 2, CHANNEL_INDEX["pitch"]].astype(np.float64)
-    turns = np.diff(np.sign(np.diff(pitch)))
-    return max(1.0, round(float(np.count_nonzero(turns)) / 2))
+    Neither what a filter adds around a nod nor the instant at which an annotator pressed a key is part of it.
+    """
+    nods = []
+    for motion in motions:
+        pitch = _pitch(motion)
+        for start, end, size in events.find_nods(pitch, FRAME_HZ):
+            swing = pitch[round(start * FRAME_HZ) : round(end * FRAME_HZ) + 1]
+            swing = swing - np.linspace(swing[0], swing[-1], len(swing))
+            swing *= np.copysign(1, swing.max() + swing.min())  # the larger way is up
+            peaks, depths = events.find_peaks(swing, _CYCLE * swing.max())
+            before, after = np.array(events.half_widths(swing, peaks, depths)) / FRAME_HZ
+            nods.append((size, after[-1] - before[0], np.median(after - before), len(peaks)))
+    return np.array(nods, float).reshape(-1, 4)
 
 
 def looks_s(gaze: Doubles) -> list[float]:
@@ -393,7 +400,7 @@ def sway_db(motions: Sequence[Floats]) -> Doubles:
     long = [motion[:, _ROTATIONS] for motion in motions if len(motion) >= _SWAY_WINDOW]
     if not long:
         return np.full(len(SWAY_BANDS_HZ), np.nan)
-    powers = [welch(np.degrees(turns.astype(np.float64)), FRAME_HZ, nperseg=_SWAY_WINDOW, axis=0) for turns in long]
+    powers = [welch(np.degrees(turns.astype(float)), FRAME_HZ, nperseg=_SWAY_WINDOW, axis=0) for turns in long]
     hz, mean = powers[0][0], np.mean([power.mean(axis=1) for _, power in powers], axis=0)
     return np.array([10 * np.log10(mean[(hz >= low) & (hz < high)].mean() + 1e-12) for low, high in SWAY_BANDS_HZ])
 

@@ -175,7 +175,7 @@ def intervals(draws: Mapping[str, Doubles]) -> dict[str, tuple[float, float]]:
     for name, values in draws.items():
         defined = values[np.isfinite(values)]
         if len(defined) >= _DEFINED * len(values):
-            low, high = ends(defined).tolist()
+            low, high = ends(defined).round(6).tolist()
             found[name] = (low, high)
     return found
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
@@ -34,8 +35,8 @@ from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import detect, open_for, split_names
 from sfms_robot.lab.corpora.reading import speaks
-from sfms_robot.lab.evaluation.detection import movement, slow_poses_deg
-from sfms_robot.lab.evaluation.intervals import ends
+from sfms_robot.lab.evaluation.detection import middle, movement, nods_of, slow_poses_deg
+from sfms_robot.lab.evaluation.intervals import Chosen, bootstrap, intervals, people_of
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread
 from sfms_robot.listeners.engine import EngineName
@@ -93,6 +94,9 @@ def evaluate_naturalness(
         np.ones(len(dyad.listener), bool) if dyad.attention is None else np.asarray(dyad.attention > 0.5)
         for dyad in dyads
     ]
+    drawn, recorded = ([nods_of([motion]) for motion in motions] for motions in (ours, theirs))
+    ratios = partial(nod_ratios, drawn, recorded)
+    tests["interval"] |= intervals(bootstrap(ratios, people_of(dyads, [1] * len(dyads), 1)))
     return {
         "listener": name,
         "engine": engine_name(listener),
@@ -100,7 +104,7 @@ def evaluate_naturalness(
         "dyads": len(dyads),
         "minutes": round(sum(map(len, ours)) * FRAME_S / 60, 1),
         **tests,
-        **compared(movement(ours, addressed), movement(theirs, addressed)),
+        **compared(ratios(np.arange(len(dyads))) | movement(ours, addressed), movement(theirs, addressed)),
         **drifted(long, theirs),
         "notes": notes(dyads, training),
     }
@@ -147,10 +151,16 @@ def long_run(listener: Listener, heard: Sequence[Sequence[SpeakerFrame]], drift_
 
 
 def compared(ours: Mapping[str, float], theirs: Mapping[str, float]) -> dict[str, Any]:
-    """Return the figures of `movement` of both, and the ratio of nod sizes; None where there is no data."""
-    ratio = ours["nod_deg"] / theirs["nod_deg"] if theirs["nod_deg"] else math.nan
-    figures = {"nod_amplitude_ratio": ratio, **ours, **{f"people_{name}": value for name, value in theirs.items()}}
+    """Return the figures of `movement` of both; None where there is no data."""
+    figures = {**ours, **{f"people_{name}": value for name, value in theirs.items()}}
     return {name: round(value, 3) if math.isfinite(value) else None for name, value in figures.items()}
+
+
+def nod_ratios(ours: Sequence[Doubles], theirs: Sequence[Doubles], chosen: Chosen) -> dict[str, float]:
+    """Return the medians of our nods in the motions at these places, as `nods_of` has them, over those of theirs."""
+    drawn, recorded = (np.concatenate([nods[place] for place in chosen]).T for nods in (ours, theirs))
+    figures = zip(("amplitude", "length", "cycle"), drawn, recorded, strict=False)
+    return {f"nod_{name}_ratio": middle(a) / middle(b) for name, a, b in figures}
 
 
 def drifted(motion: Floats, theirs: Sequence[Floats]) -> dict[str, Any]:
@@ -161,9 +171,8 @@ def drifted(motion: Floats, theirs: Sequence[Floats]) -> dict[str, Any]:
     return {
         "drift_deg": round(float(np.abs(end).max()), 2),
         "drift_outside_people_deg": round(float(outside.max()), 2),
-        "people_pose_deg": {name: [round(float(a), 2), round(float(b), 2)] for name, a, b in
-                            zip(("roll", "pitch", "yaw"), low, high, strict=True)},
-    }  # fmt: skip
+        "people_pose_deg": dict(zip(("roll", "pitch", "yaw"), np.round([low, high], 2).T.tolist(), strict=True)),
+    }
 
 
 # --- two-sample tests -----------------------------------------------------------------------------------------------
@@ -179,7 +188,7 @@ def two_samples(ours: Sequence[Floats], theirs: Sequence[Floats], training: Sequ
     half = 2 * (len(theirs) // 2)
     pairs: dict[str, tuple[Sequence[Floats], Sequence[Floats]]] = {
         "two_sample_auc": (ours, theirs),
-        "person_two_sample_auc": (theirs[0:half:2], theirs[1:half:2]),
+        "person_two_sample_auc": (theirs[:half:2], theirs[1:half:2]),
     }
     if training:
         pairs |= {"training_two_sample_auc": (training, theirs), "imitated_two_sample_auc": (ours, training)}
@@ -242,14 +251,12 @@ def separability(ours: Sequence[Floats], theirs: Sequence[Floats], region: str) 
         held_out = fold[dyad] == number
         if held_out.any() and not held_out.all():
             scores[held_out] = _scores(values[~held_out], label[~held_out], values[held_out], _SEED + number)
-    rng, drawn = np.random.default_rng(_SEED), []
-    rows = [np.flatnonzero(dyad == number) for number in range(dyad.max() + 1)]
-    for _ in range(_RESAMPLED):  # dyads, with replacement
-        chosen = np.concatenate([rows[number] for number in rng.integers(len(rows), size=len(rows))])
-        drawn.append(rank_auc(scores[chosen], label[chosen] == 1, label[chosen] == 0))
-    known = np.array(drawn)
-    low, high = ends(known[np.isfinite(known)]).tolist()
-    return rank_auc(scores, label == 1, label == 0), low, high
+
+    def auc(chosen: Chosen) -> dict[str, float]:
+        return {"auc": rank_auc(scores[chosen], label[chosen] == 1, label[chosen] == 0)}
+
+    low, high = intervals(bootstrap(auc, dyad.astype(str).tolist(), seed=_SEED, draws=_RESAMPLED))["auc"]
+    return auc(np.arange(len(dyad)))["auc"], low, high
 
 
 def _scores(values: Tensor, label: NDArray[np.intp], unseen: Tensor, seed: int) -> Doubles:

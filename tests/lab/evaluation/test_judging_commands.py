@@ -11,8 +11,8 @@ from tiny_arig_training import dyad
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES
 from sfms_robot.lab.corpora import clips
 from sfms_robot.lab.evaluation import naturalness
-from sfms_robot.lab.evaluation.detection import movement
-from sfms_robot.lab.evaluation.naturalness import FOLDS, REGIONS, compared, listening, notes
+from sfms_robot.lab.evaluation.detection import movement, nods_of
+from sfms_robot.lab.evaluation.naturalness import FOLDS, REGIONS, compared, listening, nod_ratios, notes
 from sfms_robot.lab.evaluation.robustness import CONDITIONS, RANGES, cases
 
 LEAST = 2 * FOLDS
@@ -52,6 +52,7 @@ def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tm
     assert found["listener"] == "sfms-small" and found["split"] == "test" and found["dyads"] == LEAST
     assert found["minutes"] == pytest.approx(LEAST * 12 / 60, abs=0.05) and "onnx" in found["engine"]
     rows = [f"{who}two_sample_auc" for who in ("", "person_", "training_", "imitated_")]
+    assert {"nod_amplitude_ratio", "nod_length_ratio", "nod_cycle_ratio"} < found.keys()
     for name in (*rows, *(f"levelled_{row}" for row in rows)):
         assert set(found[name]) == set(found["interval"][name]) == set(REGIONS)
         for region, auc in found[name].items():
@@ -77,9 +78,10 @@ def test_people_who_do_nothing_and_whose_gaze_nobody_knows_leave_figures_out(tmp
     data = people(tmp_path, ("validation",), count=3, listener=still, attention=None, events=())
     dyads = clips.load(data / "validation")
     nothing = movement([dyad.listener for dyad in dyads], [np.ones(len(still), bool)] * len(dyads))
-    found = compared(nothing, nothing)
+    ratios = nod_ratios([nods_of([still])] * 3, [nods_of([still])] * 3, np.arange(3))
+    found = compared({**ratios, **nothing}, nothing)
     assert [found[who + name] for who in ("", "people_") for name in NOBODY_KNOWS] == [None] * 2 * len(NOBODY_KNOWS)
-    assert found["nod_amplitude_ratio"] is None and found["gaze_on_person"] == 1.0
+    assert {found[name] for name in ratios} == {None} and found["gaze_on_person"] == 1.0
     gaze, training = notes(dyads, [])
     assert "in 3 dyads: gaze" in gaze and "training" in training
 
