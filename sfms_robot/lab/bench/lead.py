@@ -26,13 +26,12 @@ from sfms_robot.app.wiring import calibration_of
 from sfms_robot.config import Head
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import BusError
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, Bools, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.lab.bench.live_stamps import ResidentMemory
 from sfms_robot.lab.bench.measure import HEAD, Row, row
 from sfms_robot.ports import Clock, Observer, Tick
 from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.safety import Interrupt
-from sfms_robot.signals.events import Bools
 
 _HORIZON, _HOP = 8, 4  # frames of a plan, and between two plans
 _LATENCY_S: Final = 0.010  # from the last frame heard to the plan

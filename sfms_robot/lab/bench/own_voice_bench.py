@@ -19,11 +19,10 @@ from scipy.signal import correlate, fftconvolve, lfilter
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, optional
-from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Doubles, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Bools, Doubles, Floats
 from sfms_robot.lab.bench.measure import BenchResult
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.echo import EchoCanceller
-from sfms_robot.signals.events import Bools
 from sfms_robot.signals.own_voice_gate import WINDOW, OwnVoiceGate, SpeechProbability
 
 # Parameters were chosen on these calls, which are never reported on, with other gears (seed 1) and other movements.

@@ -13,7 +13,7 @@ from sfms_robot import config
 from sfms_robot.app.progress import tracked
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Doubles, Floats
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Bools, Doubles, Floats
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
 from sfms_robot.lab.evaluation.listener_tables import spread_clips
@@ -22,7 +22,6 @@ from sfms_robot.lab.evaluation.rollout import Rollout, rollouts
 from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.registry import load_listener
-from sfms_robot.signals.events import Bools
 
 _LAGS: Final = 12  # frames in both directions in which the jaw is searched
 _JAW: Final = CHANNEL_INDEX["jawOpen"]

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE_CHANNELS, Doubles, Floats, SpeakerFrame, changed
+from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE_CHANNELS, Bools, Doubles, Floats, SpeakerFrame, changed
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.corpora.conversion import at_frame_rate
@@ -42,7 +42,6 @@ from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollo
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
 from sfms_robot.ports import Listener
-from sfms_robot.signals.events import Bools
 
 _BEGINNINGS: Final[Mapping[str, tuple[str, ...]]] = {  # of the names of a region's channels
     "head": POSE_CHANNELS,
