@@ -5,9 +5,7 @@ import pytest
 from hypothesis import given, strategies
 from hypothesis.extra import numpy as arrays
 from scipy import signal
-from scipy.interpolate import PchipInterpolator
 
-from sfms_robot.retarget.channel_mapping import _monotone_cubics
 from sfms_robot.signals.events import band_pass, find_blinks, find_nods, find_peaks, find_smiles, half_widths, runs
 
 
@@ -80,11 +78,3 @@ def test_the_band_pass_is_scipys_forwards_and_backwards(rate_hz, seconds):
     np.testing.assert_allclose(
         band_pass(values, 0.8, 6.0, rate_hz), signal.sosfiltfilt(sections, values), atol=1e-12, rtol=0
     )
-
-
-@pytest.mark.parametrize("seed", range(30))
-def test_curves_are_scipys_monotone_cubics(seed):
-    random = np.random.default_rng(seed)
-    x = random.uniform(0.01, 1, random.integers(2, 8)).cumsum()
-    y = np.round(random.normal(0, 1, len(x)), seed % 3)  # flat stretches too
-    assert np.array_equal(_monotone_cubics(x, y), PchipInterpolator(x, y).c.T)
