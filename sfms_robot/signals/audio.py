@@ -255,8 +255,6 @@ def check_scale(name: str, samples: NDArray[Any]) -> None:
 
 def energy_db(samples: Floats) -> float:
     """Return the mean level of samples in dB of full scale; -100 for silence and for no samples."""
-    if not len(samples):
-        return -100.0
     return _db(float(np.add.reduce(np.square(samples, dtype=np.float64))), len(samples))
 
 
@@ -267,7 +265,7 @@ def energies_db(pieces: Floats) -> list[float]:
 
 
 def _db(energy: float, samples: int) -> float:
-    return 10 * math.log10(max(energy / samples, 1e-10))
+    return 10 * math.log10(max(energy / max(samples, 1), 1e-10))
 
 
 # --- A sampled signal between its samples, by a windowed sinc: for odd rates, and rates that change -------------------

@@ -128,11 +128,15 @@ def hear(levels_db: Doubles) -> list[bool]:
 
 def times(active: Sequence[bool] | NDArray[np.bool_]) -> Doubles:
     """Return seconds (N, 3) of speech so far, silence so far and the last phrase, of frames of speech (N,)."""
-    phase, rows = SpeechPhase(), []
-    for speaks in active:
-        phase = phase.after(bool(speaks))
-        rows.append(phase.times_s)
-    return np.reshape(rows, (-1, 3)).astype(np.float64)
+    index = np.arange(len(active))
+    newest = np.maximum.accumulate(np.where(active, index, -1))  # frame of speech
+    silence = index - newest
+    phrase = (newest >= 0) & (silence < GAP_FRAMES)
+    begins = phrase & ~np.r_[False, phrase][:-1]
+    first = np.r_[0, np.flatnonzero(begins)][np.cumsum(begins)]  # frame of the newest phrase; 0 before any
+    length = newest - first + 1  # of that phrase up to its newest speech; 0 before any
+    last = np.where(phrase, np.r_[0, length][first], length)
+    return np.stack([phrase * (index - first + 1), silence, last], axis=1) * FRAME_S
 
 
 def features(times_s: Doubles) -> Floats:

@@ -198,18 +198,13 @@ def _floor(person: MeetingPerson, talks: Mapping[str, Bools], alone: Bools) -> N
 
 def part(speaker: Sequence[SpeakerFrame], first: int, frames: int) -> list[SpeakerFrame]:
     """Return `frames` frames from `first` on, timed from the beginning of the part."""
-    return [at_time((index + 1) * FRAME_S, frame) for index, frame in enumerate(speaker[first : first + frames])]
-
-
-def shifted(speaker: Sequence[SpeakerFrame]) -> list[SpeakerFrame]:
-    """Return the input from the others `SHIFT_S` late, its end moved to the beginning; the own voice stays in place."""
-    by = round(SHIFT_S * FRAME_HZ) % len(speaker)
-    before = [*speaker[len(speaker) - by :], *speaker[: len(speaker) - by]]
     return [
-        changed(at_time(frame.time_s, other), agent_audio=frame.agent_audio)
-        for frame, other in zip(speaker, before, strict=True)
+        changed(frame, time_s=number * FRAME_S, face=frame.face and changed(frame.face, time_s=number * FRAME_S))
+        for number, frame in enumerate(speaker[first : first + frames], start=1)
     ]
 
 
-def at_time(time_s: float, frame: SpeakerFrame) -> SpeakerFrame:
-    return changed(frame, time_s=time_s, face=frame.face and changed(frame.face, time_s=time_s))
+def shifted(speaker: Sequence[SpeakerFrame]) -> Sequence[SpeakerFrame]:
+    """Return the frames `SHIFT_S` late, the end at the beginning; their times and own voice move with them."""
+    at = -round(SHIFT_S * FRAME_HZ) % len(speaker)
+    return [*speaker[at:], *speaker[:at]]

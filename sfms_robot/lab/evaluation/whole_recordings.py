@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import Final
 
 import numpy as np
@@ -19,7 +19,17 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import EVENT_KINDS, FRAME_S, MOTION_DIM, Doubles, FaceFrame, ListenerEvent, SpeakerFrame
+from sfms_robot.frames import (
+    EVENT_KINDS,
+    FRAME_S,
+    MOTION_DIM,
+    Doubles,
+    FaceFrame,
+    Floats,
+    ListenerEvent,
+    SpeakerFrame,
+    changed,
+)
 from sfms_robot.listeners.events.evidence import (
     AT,
     BACK,
@@ -38,6 +48,7 @@ from sfms_robot.listeners.events.evidence import (
     NOD_RAD,
     NODS_APART,
     OPENING,
+    OWN_VOICE_DB,
     PITCH,
     SMILES_APART,
     STANDS_OUT,
@@ -50,7 +61,6 @@ from sfms_robot.listeners.events.evidence import (
     looks_at_head,
     smile_over,
     smoothed_pitch,
-    sounds,
 )
 from sfms_robot.listeners.events.model import (
     ALWAYS,
@@ -62,11 +72,10 @@ from sfms_robot.listeners.events.model import (
     STEP_S,
     EventMemory,
     EventModel,
-    last_shift,
 )
 from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals import phase
-from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.audio import energies_db
 from sfms_robot.signals.event_sizes import SWING_S
 
 Bools = NDArray[np.bool_]
@@ -179,8 +188,8 @@ def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
     lengths[lengths < (FLOOR_FRAMES - 0.5) * FRAME_S] = np.inf
     newest = np.maximum.accumulate(np.where(np.isfinite(lengths).any(axis=1), index, -1))
     holder = np.where(newest >= 0, np.argmin(lengths, axis=1)[newest], NOBODY)
-    changed = holder != np.r_[NOBODY, holder][:-1]
-    return holder, np.maximum.accumulate(np.where(changed, index, 0))
+    passed = holder != np.r_[NOBODY, holder][:-1]
+    return holder, np.maximum.accumulate(np.where(passed, index, 0))
 
 
 def signs_in(faces: Sequence[FaceFrame | None]) -> Doubles:
@@ -230,12 +239,25 @@ def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") ->
     nods, smiles, laughs, speaks[:, 1] = signs_in([frame.face for frame in speaker]).T
     nods, laughs = nods > 0, laughs > 0
     first = next((index for index, frame in enumerate(speaker) if len(frame.audio)), len(speaker))  # deaf until then
-    speaks[first:, 1] = phase.hear(np.array([energy_db(frame.audio) for frame in speaker[first:]]))
+    speaks[first:, 1] = phase.hear(_levels_db([frame.audio for frame in speaker[first:]]))
+    speaks[:, 0] = (
+        _levels_db([frame.audio[:0] if frame.agent_audio is None else frame.agent_audio for frame in speaker])
+        > OWN_VOICE_DB
+    )
     for index, frame in enumerate(speaker):
-        speaks[index, 0] = sounds(frame.agent_audio)
         looks[index, 1], memory = looks_at_head(frame, memory)
     silent = phase.times(speaks[:, 1])[:, 0] == 0
     return Scene(speaks, looks, laughs, nods & silent & np.r_[True, silent][:-1], smiles)
+
+
+def _levels_db(pieces: Sequence[Floats]) -> Doubles:
+    """Return `energy_db` of each piece, of many pieces of the same length at once."""
+    levels_db = list[float]()
+    for _, alike in groupby(pieces, len):
+        rows = [*alike]
+        for at in range(0, len(rows), _TOGETHER):
+            levels_db += energies_db(np.stack(rows[at : at + _TOGETHER]))
+    return np.array(levels_db)
 
 
 _SINCE_END: Final = ("nod", "laugh", "smile", "shake", "tilt", "brow_raise")
@@ -391,28 +413,42 @@ def decisions(
     """Return the decisions for each seed without a given history, skipping steps at which no event can begin."""
     steps = steps_in(len(heard))
     most = most_in(model, heard[steps], calmness)
-    found = []
+    streams = []
     for seed in seeds:
-        draws = np.array([uniforms(seed, step, Use.EVENT, len(EVENT_KINDS))[model.draws] for step in steps.tolist()])
-        frames = [*steps[(draws < most).any(axis=1)].tolist(), len(heard)]
-        found.append(_decided(model, heard, frames, model.start(seed, calmness)))
-    return found
+        draws = np.reshape(
+            [uniforms(seed, at, Use.EVENT, len(EVENT_KINDS)) for at in steps.tolist()], (-1, len(EVENT_KINDS))
+        )
+        frames = [*steps[(draws[:, model.draws] < most).any(axis=1)].tolist(), len(heard)]
+        streams.append(_Decider(model.start(seed, calmness), frames))
+    while ahead := [stream for stream in streams if stream.frame < len(heard)]:  # each at a time of its own
+        sensed = [Sensed(stream.frame, heard[stream.frame]) for stream in ahead]
+        decided = model.decide_each(sensed, [stream.memory for stream in ahead])
+        for stream, (decision, memory) in zip(ahead, decided, strict=True):
+            stream.take(decision.events, memory)
+    return [tuple(stream.events) for stream in streams]
 
 
-def _decided(
-    model: EventModel, heard: Doubles, frames: Sequence[int], memory: EventMemory
-) -> tuple[ListenerEvent, ...]:
-    """Decide at the end of each of `frames`, the last of which is beyond the end."""
-    found = list[ListenerEvent]()
-    at, look_back = 0, math.inf  # the frame from which on a look aside is over
-    while (frame := min(frames[at], look_back)) < len(heard):
-        ((decision, memory),) = model.decide_each([Sensed(int(frame), heard[int(frame)])], [memory])
-        found += decision.events
-        at += frame == frames[at]
-        look = last_shift(memory.done)
-        over = math.inf  # the step at which the newest look is over, if it goes aside
+class _Decider:
+    """A stream that decides at the end of some frames, the last of which is beyond the end.
+
+    Attributes:
+        frame: The next one.
+    """
+
+    def __init__(self, memory: EventMemory, frames: Sequence[int]) -> None:
+        self.memory, self.events = memory, list[ListenerEvent]()
+        self._frames = iter(frames)
+        self.frame = self._drawn = next(self._frames)
+
+    def take(self, events: Sequence[ListenerEvent], memory: EventMemory) -> None:
+        """Keep what was decided, and find the next frame: a look away ends at a step that nothing is drawn for."""
+        self.events += events
+        newest = {event.kind: event for event in memory.done}  # of others than nods no more is asked for
+        self.memory = changed(memory, done=tuple(e for e in memory.done if e.kind == "nod" or newest[e.kind] is e))
+        step, look = self.frame + STEP_FRAMES, newest.get("gaze_shift")
+        if self.frame == self._drawn:
+            self._drawn = next(self._frames)
+        self.frame = self._drawn
         if look is not None and look.target_rad != AT_PERSON:
-            step = math.ceil((look.end_s / FRAME_S - 1 - LEAD_FRAMES - 1e-6 - (STEP_FRAMES - 1)) / STEP_FRAMES)
-            over = step * STEP_FRAMES + STEP_FRAMES - 1
-        look_back = max(frame + STEP_FRAMES, over)
-    return tuple(found)
+            over = math.ceil((look.end_s / FRAME_S - 1 - LEAD_FRAMES - 1e-6 - (STEP_FRAMES - 1)) / STEP_FRAMES)
+            self.frame = min(self._drawn, max(step, over * STEP_FRAMES + STEP_FRAMES - 1))

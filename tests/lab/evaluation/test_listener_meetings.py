@@ -110,15 +110,11 @@ def frames(count):
 
 
 @pytest.mark.parametrize(("count", "by"), [(1510, 1500), (1500, 0)])
-def test_shifting_moves_the_others_and_nothing_of_the_listener(count, by):
+def test_shifting_puts_another_minute_in_the_place_of_each(count, by):
     assert round(SHIFT_S * FRAME_HZ) % count == by
     before = frames(count)
-    for index, frame in enumerate(shifted(before)):
-        other = before[index - by]
-        assert frame.time_s == before[index].time_s == frame.face.time_s
-        assert frame.agent_audio is before[index].agent_audio
-        assert frame.audio is other.audio and frame.attention == other.attention
-        np.testing.assert_array_equal(frame.face.pose, other.face.pose)
+    late = shifted(before)
+    assert len(late) == count and all(frame is before[index - by] for index, frame in enumerate(late))
 
 
 def test_a_part_is_timed_from_its_own_beginning():
