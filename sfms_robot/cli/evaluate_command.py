@@ -100,24 +100,18 @@ def listener_(
     if table is None:
         show(evaluate_listener(listener, data, seed, order, hop, split), json)
         return
-    if of_arig:
-        if order is not None or hop is not None:
-            raise BadParameter("--order and --hop are for --table 1 and 2, or none")
-        from sfms_robot.lab.evaluation.arig_tables import arig_table
+    if of_arig and (order is not None or hop is not None):
+        raise BadParameter("--order and --hop are for --table 1 and 2, or none")
+    from sfms_robot.lab.evaluation.arig_tables import TableOptions, arig_table, sfms_table
 
-        trained: dict[str, Any] = {
-            "models": models, "training": config, "steps": steps, "seeds": seeds, "split": split,
-        }  # fmt: skip
-        found = interruptible(lambda: arig_table(table, listener, data, clips=clips, seed=seed, **trained))
-        show(found, json, note=_INTERVALS)
-        return
-    from sfms_robot.lab.evaluation.arig_tables import sfms_table
-
-    options: dict[str, Any] = {
-        "samples": samples, "limit": clips, "seed": seed, "order": order, "hop": hop,
-        "models": models, "steps": steps, "split": split,
-    }  # fmt: skip
-    show(interruptible(lambda: sfms_table(int(table), listener, data, **options)), json, note=_INTERVALS)
+    options = TableOptions(
+        data=data, models=models, clips=clips, samples=samples, steps=steps, seed=seed, seeds=seeds, split=split,
+        training=config, order=order, hop=hop,
+    )  # fmt: skip
+    found = interruptible(
+        lambda: arig_table(table, listener, options) if of_arig else sfms_table(int(table), listener, options)
+    )
+    show(found, json, note=_INTERVALS)
 
 
 @app.command()
@@ -138,13 +132,13 @@ def papers(
     json: bool = JSON,
 ) -> None:
     """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
-    from sfms_robot.lab.evaluation.arig_tables import EVERY, evaluate_papers
+    from sfms_robot.lab.evaluation.arig_tables import EVERY, TableOptions, evaluate_papers
 
-    options: dict[str, Any] = {
-        "clips": clips, "samples": samples, "steps": steps, "seed": seed, "seeds": seeds, "split": split,
-    }  # fmt: skip
+    options = TableOptions(
+        data=data, models=models, clips=clips, samples=samples, steps=steps, seed=seed, seeds=seeds, split=split
+    )
     each = _quiet if json else _print_paper
-    show(interruptible(lambda: evaluate_papers(data, models, table or EVERY, each, **options)), json, _quiet)
+    show(interruptible(lambda: evaluate_papers(options, table or EVERY, each)), json, _quiet)
 
 
 @app.command()

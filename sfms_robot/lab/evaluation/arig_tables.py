@@ -12,6 +12,7 @@ size, steps and data of the shipped listener, and nothing beyond the paper. Thei
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, Literal
@@ -89,6 +90,37 @@ ABLATIONS: Final[Mapping[int, Mapping[str, Mapping[str, Any]]]] = {
         "w/o bidirectional-integrated learning": {"interaction": "linear"},
     },
 }
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableOptions:
+    """Options of the papers' tables.
+
+    Attributes:
+        data: Composed dyads; tables of ARIG need speaking/ and interaction/ in it.
+        models: Folder of listeners and tokenizers that only tables need, trained if missing; with it each table
+            includes the paper as written.
+        clips: Most dyads for a table.
+        samples: Answers to every clip of tables 1 and 2 of SFMS.
+        steps: Of every training, in place of its file's.
+        seed: Of the listeners.
+        seeds: Trainings of each row of `arig-1` and `arig-4`.
+        split: Part of the dyads; of tables 3 and 4 the held-out recordings.
+        training: Training file of ARIG's ablations; None: the paper as written.
+        order, hop: Of tables 1 and 2 of SFMS; see `load_at_hop`.
+    """
+
+    data: Path
+    models: Path | None
+    clips: int | None
+    samples: int
+    steps: int | None
+    seed: int
+    seeds: int
+    split: str
+    training: Path | None = None
+    order: Order | None = None
+    hop: int | None = None
 
 
 def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str, Doubles]) -> dict[str, float]:
@@ -188,73 +220,52 @@ def _merit(metric: str, row: Mapping[str, Doubles], people: Mapping[str, Doubles
 # --- listeners that are played --------------------------------------------------------------------------------------
 
 
-def arig_table(
-    name: str,
-    names: Sequence[str],
-    data: Path,
-    *,
-    clips: int | None,
-    seed: int,
-    models: Path | None,
-    training: Path | None = None,
-    steps: int | None = None,
-    seeds: int = 1,
-    split: str = "test",
-    train: bool = True,
-) -> dict[str, Any]:
+def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bool = True) -> dict[str, Any]:
     """Return `arig-2`: `names` side by side on the listening set; or `arig-1`, `arig-4`: ablations, on interaction.
 
     Args:
         name: Of `ARIG_TABLES`.
         names: Listeners, by name or folder.
-        data: Composed dyads.
-        clips: Most dyads.
-        seed: Of the listeners.
-        models: Folder of listeners that only tables need; with it each table includes the paper as written.
-        training: Training file of the ablations; None: the paper as written.
-        steps: Of a training, in place of the file's.
-        seeds: Trainings of each row of `arig-1` and `arig-4`.
-        split: Part of the dyads.
+        options: Of the tables.
         train: Train missing ablations; else their rows are left out.
 
     Raises ConfigError.
     """
-    if name not in ARIG_TABLES:
-        raise ConfigError(f"--table {name}: is not one of {', '.join(ARIG_TABLES)}")
+    data, models, split = options.data, options.models, options.split
     scenes = open_scenes(data, split)
     number = int(name.removeprefix("arig-"))
     scene = "listening" if number == 2 else "interaction"
     if scene not in scenes:
         raise ConfigError(f"{data / scene}: no {split} dyads, which --table {name} needs")
-    held_out = [dyad for dyad in spread_clips(scenes[scene], clips) if len(dyad.listener) >= CLIP_FRAMES]
+    held_out = [dyad for dyad in spread_clips(scenes[scene], options.clips) if len(dyad.listener) >= CLIP_FRAMES]
     if not held_out:
         raise ConfigError(f"{data}: no {split} dyad is as long as a clip of {CLIP_FRAMES} frames")
     folders = {one: [find("listeners", one, "config.yaml")] for one in names}
     if number != 2 and train:
         if models is None:
             raise ConfigError(f"--table {name}: needs --models DIR, where its listeners are trained and kept")
-        unchanged = "arig-as-written" if training is None else "arig"
+        unchanged = "arig-as-written" if options.training is None else "arig"
         rows: dict[str, Mapping[str, Any]] = {"ARIG": {}, **(READINGS if number == 1 else {})}
         rows |= {label: {"changes": changes} for label, changes in ABLATIONS[number].items()}
         folders = {
             label: [
                 trained(
                     "arig", models / (_folder(label) if differing else unchanged), data,
-                    file=training, steps=steps, seed=trial, changes=differing.get("changes", {}),
+                    file=options.training, steps=options.steps, seed=trial, changes=differing.get("changes", {}),
                     phase_changes=differing.get("phase_changes", {}),
                 )
-                for trial in range(1, seeds + 1)
+                for trial in range(1, options.seeds + 1)
             ]
             for label, differing in rows.items()
         } | folders  # fmt: skip
     elif models is not None:
-        folders[LABELS["arig"]] = [trained("arig", models / "arig-as-written", data, steps=steps)]
+        folders[LABELS["arig"]] = [trained("arig", models / "arig-as-written", data, steps=options.steps)]
     answers = {}
     for label, each in folders.items():
         rolled = [
             one.motion[0]
             for folder in each
-            for one in rollouts(load_listener(folder), tracked(held_out, label), seed, CLIP_FRAMES)
+            for one in rollouts(load_listener(folder), tracked(held_out, label), options.seed, CLIP_FRAMES)
         ]
         answers[label] = cut(rolled, CLIP_FRAMES)
     truth, speaker = (cut([getattr(one, who) for one in held_out], CLIP_FRAMES) for who in ("listener", "speaker"))
@@ -319,88 +330,48 @@ EVERY: Final = (*_SFMS_TABLES, *TOKENIZER_TABLES, *ARIG_TABLES)
 
 
 def evaluate_papers(
-    data: Path,
-    models: Path | None,
-    tables: Sequence[str],
-    each: Callable[[str, dict[str, Any]], None],
-    *,
-    clips: int | None,
-    samples: int,
-    steps: int | None,
-    seed: int,
-    seeds: int = 1,
-    split: str = "test",
+    options: TableOptions, tables: Sequence[str], each: Callable[[str, dict[str, Any]], None]
 ) -> dict[str, Any]:
-    """Return every table; call `each(name, table)` as soon as one is done.
+    """Return the `tables` (of `EVERY`); call `each(name, table)` as soon as one is done.
 
-    Blocks for minutes; for hours if listeners have to be trained. An interrupted training is resumed.
-
-    Args:
-        data: Composed dyads, with speaking/ and interaction/.
-        models: Folder of listeners and tokenizers for tables alone, trained if missing; None: their rows are left out,
-            and `not_trained` of a table lists how to make them.
-        tables: Of `EVERY`.
-        each: Called with every table.
-        clips: Most dyads for a table.
-        samples: Answers to every clip of tables 1 and 2.
-        steps: Of every training, in place of its file's.
-        seed: Of the listeners.
-        seeds: Trainings of each row of ARIG's tables 1 and 4.
-        split: Part of the dyads; of tables 3 and 4 the held-out recordings.
-
-    Raises ConfigError.
+    Without a folder of models their rows are left out, and `not_trained` of a table lists how to make them. Blocks for
+    minutes; for hours if listeners have to be trained. An interrupted training is resumed. Raises ConfigError.
     """
     unknown = [name for name in tables if name not in EVERY]
     if unknown:
         raise ConfigError(f"--table {unknown[0]}: is not one of {', '.join(EVERY)}")
     found: dict[str, dict[str, Any]] = {}
+    models = options.models
     for name in tables:
         if name in TOKENIZER_TABLES:
-            found[name] = evaluate_table(name, models=None if models is None else models / "tokenizers", steps=steps)
+            found[name] = evaluate_table(name, models=models and models / "tokenizers", steps=options.steps)
         elif name in _SFMS_TABLES:
-            found[name] = sfms_table(
-                int(name), [_SFMS], data, samples=samples, limit=clips, seed=seed, models=models, steps=steps,
-                split=split,
-            )  # fmt: skip
+            found[name] = sfms_table(int(name), [_SFMS], options)
         else:
-            names, train = [_ARIG, _SFMS] if name == "arig-2" else [_ARIG], models is not None
-            found[name] = arig_table(
-                name, names, data, clips=clips, seed=seed, models=models, steps=steps, seeds=seeds, split=split,
-                train=train,
-            )  # fmt: skip
+            names = [_ARIG, _SFMS] if name == "arig-2" else [_ARIG]
+            found[name] = arig_table(name, names, options, train=models is not None)
         if models is None:
             found[name]["not_trained"] = _not_trained(name)
         each(name, found[name])
     return {"tables": found}
 
 
-def sfms_table(
-    number: int,
-    names: Sequence[str],
-    data: Path,
-    *,
-    samples: int,
-    limit: int | None,
-    seed: int,
-    order: Order | None = None,
-    hop: int | None = None,
-    models: Path | None = None,
-    steps: int | None = None,
-    split: str = "test",
-) -> dict[str, Any]:
-    """Return table 1 or 2 of SFMS for listeners by name; with a folder `models` also for the paper as written."""
-    listeners = {name: load_at_hop(name, hop, "auto") for name in names}
-    if models is not None:
-        written = trained("sfms", models / "sfms-as-written", data, steps=steps, order=order)
+def sfms_table(number: int, names: Sequence[str], options: TableOptions) -> dict[str, Any]:
+    """Return table 1 or 2 of SFMS for listeners by name; with a folder of models also for the paper as written."""
+    data, order, samples = options.data, options.order, options.samples
+    listeners = {name: load_at_hop(name, options.hop, "auto") for name in names}
+    if options.models is not None:
+        written = trained("sfms", options.models / "sfms-as-written", data, steps=options.steps, order=order)
         listeners[LABELS["sfms"]] = load_at_hop(str(written))
     space = shared_space(listeners)
     features = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
     train, held_out = (
         spread_clips(open_for(space.name, data, part, order, features), most)
-        for part, most in (("train", _TRAIN_DYADS), (split, limit))
+        for part, most in (("train", _TRAIN_DYADS), (options.split, options.clips))
     )
-    found, given = collect(number, listeners, space, train, held_out, range(seed, seed + samples))
-    return {**table(number, found, given, samples, seed), "split": split}
+    seeds = range(options.seed, options.seed + samples)
+    found, given = collect(number, listeners, space, train, held_out, seeds)
+    return {**table(number, found, given, samples, options.seed), "split": options.split}
 
 
 def _not_trained(name: str) -> dict[str, str]:

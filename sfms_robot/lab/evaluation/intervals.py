@@ -185,12 +185,12 @@ def intervals(draws: Mapping[str, Doubles]) -> dict[str, tuple[float, float]]:
 Verdict = Literal["holds", "does not hold", "open"]
 
 
-def verdict(interval: tuple[float, float] | None, bound: float = 0.0, *, comparable: bool = True) -> Verdict:
-    """Return whether "above `bound`", as a paper states it, holds of a figure with this interval.
+def verdict(interval: tuple[float, float] | None, *, comparable: bool = True) -> Verdict:
+    """Return whether "above 0", as a paper states it, holds of a figure with this interval.
 
-    It holds where the whole interval is above the bound and does not hold where the whole interval is at or below it.
-    Else, without an interval, and where what is compared is not `comparable`, it is open.
+    It holds where the whole interval is above 0 and does not hold where the whole interval is at or below it. Else,
+    without an interval, and where what is compared is not `comparable`, it is open.
     """
     if interval is None or not comparable:
         return "open"
-    return "holds" if interval[0] > bound else "does not hold" if interval[1] <= bound else "open"
+    return "holds" if interval[0] > 0 else "does not hold" if interval[1] <= 0 else "open"
