@@ -96,32 +96,7 @@ _BASELINES: Final = {  # kind, quantizer, levels
     "dense-fsq-32": ("dense", "fsq", (8, 4)),  # figure 6
     "dense-fsq-200": ("dense", "fsq", (8, 5, 5)),
 }
-
-
-def recipes(size: SizeName = "small", steps: int | None = None) -> dict[str, config.Recipe]:
-    """Return every tokenizer of both tables."""
-    width, layers, baseline_layers, score_width, training = SIZES[size]
-    training, asked = {**training, "evaluate_every": 0}, {} if steps is None else {"steps": steps}
-    shared = {
-        "kind": "sfms", "placement": "learned", "tokenizer_width": width, "tokenizer_layers": layers,
-        "scores": {"width": score_width}, "quantizer": "fsq", "inpainter": "residual",
-    }  # fmt: skip
-    raw = {
-        name: {"model": shared | changes, "training": _differing(name, training)} for name, changes in _SPARSE.items()
-    }
-    for name, (kind, quantizer, levels) in _BASELINES.items():
-        model = {"kind": kind, "quantizer": quantizer, "levels": levels, "width": width, "layers": baseline_layers}
-        # The encoder term of Learning2Listen's published configuration weighs a quarter.
-        raw[name] = {"model": model, "training": training | {"commitment": 0.25}}
-    return {
-        name: parse(config.Recipe, each | {"training": each["training"] | asked}, name) for name, each in raw.items()
-    }
-
-
-def _differing(name: str, training: dict[str, Any]) -> dict[str, Any]:
-    for ending, changes in _TRAINED.items():
-        training = training | changes if name.endswith(ending) else training
-    return training
+NAMES: Final = (*_SPARSE, *_BASELINES)
 
 
 def seeded(name: str, seeds: int) -> list[str]:
@@ -130,9 +105,23 @@ def seeded(name: str, seeds: int) -> list[str]:
 
 
 def recipe_of(name: str, size: SizeName = "small", steps: int | None = None) -> config.Recipe:
-    """Return the recipe of a tokenizer, perhaps with the seed of its name."""
+    """Return the recipe of a tokenizer of `NAMES`, perhaps with the seed of its name."""
     base, _, seed = name.partition(_SEED)
-    return recipes(size, steps)[base].model_copy(update={"seed": int(seed or 1)})
+    width, layers, baseline_layers, score_width, training = SIZES[size]
+    training = {**training, "evaluate_every": 0}
+    if base in _BASELINES:
+        kind, quantizer, levels = _BASELINES[base]
+        model = {"kind": kind, "quantizer": quantizer, "levels": levels, "width": width, "layers": baseline_layers}
+        training["commitment"] = 0.25  # the encoder term of Learning2Listen's published configuration
+    else:
+        model = {
+            "kind": "sfms", "placement": "learned", "tokenizer_width": width, "tokenizer_layers": layers,
+            "scores": {"width": score_width}, "quantizer": "fsq", "inpainter": "residual", **_SPARSE[base],
+        }  # fmt: skip
+    for ending, changes in _TRAINED.items():
+        training |= changes if base.endswith(ending) else {}
+    training |= {} if steps is None else {"steps": steps}
+    return parse(config.Recipe, {"model": model, "training": training, "seed": int(seed or 1)}, name)
 
 
 # --- baselines ------------------------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import call
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -28,7 +29,7 @@ from sfms_robot.lab.evaluation.table_tokenizers import (
     save_tokenizer,
 )
 from sfms_robot.lab.learning.corpus import first_frames, windows
-from sfms_robot.lab.learning.job import Job, Run, progress_bar
+from sfms_robot.lab.learning.job import Job, Run, Watch, progress_bar
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import amplified, loss_of_steps, optimizers_of
 from sfms_robot.lab.learning.train_runs import device_of
 from sfms_robot.lab.learning.training_loop import checkpoint_file, fit, optimizer
@@ -64,30 +65,23 @@ def train_all(
     """
     order = examples[..., SHAPES].var(1).mean(1).argsort(descending=True)
     watched = examples[order[[round(share * (len(order) - 1)) for share in _WATCHED]]]
-    tasks = [
-        (
-            recipe_of(name, size, steps),
-            Run(resume=not again and checkpoint_file(out / name, name).is_file(), device=device_of("auto")),
-            name,
-        )
-        for name in names
-    ]
+
+    def task(name: str, *watches: Watch) -> partial[None]:
+        resume = not again and checkpoint_file(out / name, name).is_file()
+        run = Run(resume=resume, device=device_of("auto"), watches=watches)
+        return partial(train, name, recipe_of(name, size, steps), takes, out, run, watched)
+
     try:
         if jobs > 1:
-            run_in_processes(partial(_train_one, takes, out, watched), tasks, jobs, "tokenizers trained")
+            run_in_processes(call, [task(name) for name in names], jobs, "tokenizers trained")
             return
         with progress_bar() as watch:
-            for recipe, run, name in tasks:
-                train(name, recipe, takes, out, replace(run, watches=(watch,)), watched)
+            for name in names:
+                task(name, watch)()
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted; {out} keeps the trained tokenizers: without --train the command resumes"
         ) from None
-
-
-def _train_one(takes: Sequence[Take], out: Path, watched: Tensor, task: tuple[config.Recipe, Run, str]) -> None:
-    recipe, run, name = task
-    train(name, recipe, takes, out, run, watched)
 
 
 def train(

@@ -216,6 +216,7 @@ def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | N
     errors, angle_rmse_rad, shape_rmse = restoration_errors(model, motion, restored)
     shape = (None, None) if clusters is None else integrity(_doubles(restored), _doubles(motion), clusters)
     silhouette, separation = (value and round(value, 3) for value in shape)
+    counts = [] if mask is None else mask.sum(1).mean(0).round().int().tolist()  # keyframes of each group
     names = np.array(seen.takes)
     return {
         "name": spec.name,
@@ -223,7 +224,7 @@ def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | N
         "k": spec.k,
         "params": sum(p.numel() for p in model.tokenizer.parameters()),
         "steps": model.recipe.training.steps,
-        "bits_per_window": round(model.bits(spec.placement, _counts(mask)), 1),
+        "bits_per_window": round(model.bits(spec.placement, counts), 1),
         "mse": float(errors.mean()),
         "median": float(np.median(errors)),
         "per_take": {take: float(errors[names == take].mean()) for take in dict.fromkeys(seen.takes)},
@@ -235,11 +236,6 @@ def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | N
         "note": spec.note,
         **({} if mask is None else placed(model, motion, mask)),
     }, errors
-
-
-def _counts(mask: Tensor | None) -> list[int]:
-    """Return the mean number of keyframes of each group, rounded; empty without keyframes."""
-    return [] if mask is None else mask.sum(1).mean(0).round().int().tolist()
 
 
 def placed(model: TableModel, motion: Tensor, mask: Tensor) -> dict[str, float]:

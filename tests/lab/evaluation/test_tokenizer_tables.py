@@ -16,11 +16,11 @@ from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.lab.corpora.clips import read_takes
 from sfms_robot.lab.evaluation import tokenizer_tables
 from sfms_robot.lab.evaluation.table_tokenizers import (
+    NAMES,
     TableModel,
     keyframe_bits,
     load_tokenizer,
     recipe_of,
-    recipes,
     save_tokenizer,
     seeded,
 )
@@ -33,7 +33,7 @@ from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.placement import place_exact
 from sfms_robot.signals.tracks import Take
 
-RECIPES = recipes(steps=3)
+RECIPES = {name: recipe_of(name, steps=3) for name in NAMES}
 TRAINING = {"steps": 3, "batch": 2, "learning_rate": 1e-3, "evaluate_every": 0, "score_tracks": 4}
 
 
