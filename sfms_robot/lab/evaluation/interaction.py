@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.app.progress import tracked
-from sfms_robot.config import find
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Doubles, Floats
@@ -23,13 +22,13 @@ from sfms_robot.lab.evaluation.rollout import Rollout, rollouts
 from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.registry import load_listener
+from sfms_robot.signals.events import Bools
 
 _LAGS: Final = 12  # frames in both directions in which the jaw is searched
 _JAW: Final = CHANNEL_INDEX["jawOpen"]
 _STILL: Final = 1e-4  # deviation of a jaw that does not move
 
 States = NDArray[np.int8]
-Bools = NDArray[np.bool_]
 
 
 def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, split: str = "test") -> dict[str, Any]:
@@ -37,7 +36,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, sp
 
     At most `clips` dyads of each set. Raises ConfigError for a listener without states, or data without such sets.
     """
-    listener = load_listener(find("listeners", name, "config.yaml"))
+    listener = load_listener(name)
     settings = getattr(getattr(listener, "how", listener), "settings", None)
     if not isinstance(settings, config.Arig):
         raise ConfigError(f"--listener {name}: does not speak; this command evaluates listeners of kind arig")

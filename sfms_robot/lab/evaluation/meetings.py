@@ -16,7 +16,6 @@ from typing import Any, Final, Self
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats, SpeakerFrame, changed
 from sfms_robot.lab.corpora.clips import Split
@@ -32,7 +31,7 @@ from sfms_robot.lab.evaluation.listener_meetings import (
     part,
     shifted,
 )
-from sfms_robot.lab.evaluation.robustness import voice_folders
+from sfms_robot.lab.evaluation.robustness import motions_of, voice_folders
 from sfms_robot.lab.evaluation.rollout import load_at_hop, rollout, run_in_processes, spread
 from sfms_robot.lab.evaluation.whole_recordings import (
     decisions,
@@ -66,7 +65,7 @@ from sfms_robot.listeners.events.model import (
 from sfms_robot.listeners.registry import engine_name
 from sfms_robot.ports import Listener
 from sfms_robot.signals import phase
-from sfms_robot.signals.motion_primitives import Motions, read_motions
+from sfms_robot.signals.motion_primitives import Motions
 
 _PREFIXES: Final = {"annotated": "annotated_", "decided": "decided_", "people": "people_", "R2": "r2_"}
 
@@ -118,7 +117,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
     chosen = spread(people_of(people, options.split, options.allow_training), options.meetings)
     training = split_series(people)["train"]
     baselines = (timing.table_rates(training), ReferenceHazard.of(training)) if training else None
-    calibration = DetectorCalibration.of(_motions(options.split))
+    calibration = DetectorCalibration.of(motions_of(options.split))
     tasks = [(people.index(person), person) for person in chosen]
     played = run_in_processes(partial(_play, options, baselines, calibration), tasks, options.jobs, "people listening")
     sums = timing.per_person((one.participant, one.sums) for one in played)
@@ -195,10 +194,12 @@ def _play(
         sums["table_nod_auc"] = timing.ranked(rates[timing.cells(phase.times(one.others))], one)
         sums |= timing.hazard_sums("r2_", one, *reference.scores(person, one.frames))
     seeds = range(1000 * (options.seed + number), 1000 * (options.seed + number) + options.seeds)
+    model: object = listener
+    calmness = Calmness()
     if isinstance(listener, EventfulListener):
-        sums |= _by_events(listener.when, listener.calmness, person, one, seeds, options.own_voice)
-    if isinstance(listener, EventModel):
-        sums |= _by_events(listener, Calmness(), person, one, seeds, options.own_voice)
+        model, calmness = listener.when, listener.calmness
+    if isinstance(model, EventModel):
+        sums |= _by_events(model, calmness, person, one, seeds, options.own_voice)
     sightings: Mapping[str, Sightings] = {}
     if frames and not isinstance(listener, EventModel):
         speaker = part(one.speaker, first, frames)
@@ -255,11 +256,7 @@ def _listener(options: TimingOptions) -> Listener | EventModel:
 def _material(split: Split, data: Path) -> tuple[Sequence[VoiceClip], Sequence[Floats], Motions]:
     """Return voices, laughter and motions of the split."""
     folders = voice_folders(data)
-    return split_voices(find_voices(folders))[split], find_laughter(folders)[split], _motions(split)
-
-
-def _motions(split: Split) -> Motions:
-    return read_motions(data_dir("sim") / "listeners" / "motions.npz")[split]
+    return split_voices(find_voices(folders))[split], find_laughter(folders)[split], motions_of(split)
 
 
 # --- the report -----------------------------------------------------------------------------------------------------

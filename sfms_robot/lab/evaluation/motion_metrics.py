@@ -26,6 +26,7 @@ from sfms_robot.signals.tracks import read_track, resample
 
 ATTRIBUTES: Final = "attributes25"  # of the REACT challenge: 15 action units, valence, arousal, 8 expressions
 WIDTHS: Final = {"arkit58": 58, "faceverse58": 58, "deca56": 56, ATTRIBUTES: 25}
+_SPACES: Final = ", ".join(f"{channels} ({space})" for space, channels in WIDTHS.items())
 _TRACKS: Final = (".csv", ".csv.gz")
 _SHOWN: Final = 3  # names of a message
 
@@ -133,14 +134,10 @@ def _track(file: Path) -> Doubles:
 def _space(space: str | None, file: Path, width: int) -> str:
     found = space or next((name for name, channels in WIDTHS.items() if channels == width), None)
     if found is None:
-        raise ConfigError(f"{file}: {width} channels, not {_spaces()}")
+        raise ConfigError(f"{file}: {width} channels, not {_SPACES}")
     if found not in WIDTHS:
         raise ConfigError(f"--space {found}: not one of {', '.join(WIDTHS)}")
     return found
-
-
-def _spaces() -> str:
-    return ", ".join(f"{channels} ({space})" for space, channels in WIDTHS.items())
 
 
 def _check(path: Path, name: str, clip: Doubles, width: int, *, answers: bool) -> None:
@@ -149,7 +146,7 @@ def _check(path: Path, name: str, clip: Doubles, width: int, *, answers: bool) -
             f"{path}: clip {name} has shape {clip.shape}; only a prediction has several answers to a clip"
         )
     if clip.shape[-1] != width:
-        raise ConfigError(f"{path}: clip {name} has {clip.shape[-1]} channels, not {width}; known: {_spaces()}")
+        raise ConfigError(f"{path}: clip {name} has {clip.shape[-1]} channels, not {width}; known: {_SPACES}")
     if not np.isfinite(clip).all():
         raise ConfigError(f"{path}: clip {name} has values that are not finite (a face that was lost?)")
 

@@ -28,7 +28,7 @@ from torch import Tensor, nn
 
 from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_HZ, FRAME_S, Doubles, Floats, SpeakerFrame, changed
+from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE_CHANNELS, Doubles, Floats, SpeakerFrame, changed
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.corpora.conversion import at_frame_rate
@@ -41,14 +41,18 @@ from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollo
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
 from sfms_robot.ports import Listener
+from sfms_robot.signals.events import Bools
 
-Bools = NDArray[np.bool_]
-REGIONS: Final[Mapping[str, tuple[int, ...]]] = {
-    "head": tuple(range(6)),
-    "eyes": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith("eyeLook")),
-    "lids": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith(("eyeBlink", "eyeSquint", "eyeWide"))),
-    "mouth": tuple(CHANNEL_INDEX[n] for n in CHANNELS if n.startswith(("jaw", "mouth", "cheek", "nose", "tongue"))),
-    "brows": tuple(CHANNEL_INDEX[name] for name in CHANNELS if name.startswith("brow")),
+_BEGINNINGS: Final[Mapping[str, tuple[str, ...]]] = {  # of the names of a region's channels
+    "head": POSE_CHANNELS,
+    "eyes": ("eyeLook",),
+    "lids": ("eyeBlink", "eyeSquint", "eyeWide"),
+    "mouth": ("jaw", "mouth", "cheek", "nose", "tongue"),
+    "brows": ("brow",),
+}
+REGIONS: Final = {
+    region: [index for index, name in enumerate(CHANNELS) if name.startswith(names)]
+    for region, names in _BEGINNINGS.items()
 }
 FOLDS: Final = 5
 WINDOW: Final = 2 * FRAME_HZ
@@ -227,8 +231,7 @@ def separability(ours: Sequence[Floats], theirs: Sequence[Floats], region: str) 
     """
     if len(ours) != len(theirs) or len(ours) < FOLDS:
         raise ValueError(f"dyads: expected equally many, {FOLDS} or more, got {len(ours)} and {len(theirs)}")
-    channels = list(REGIONS[region])
-    clips = [part[..., channels] for part in (*ours, *theirs)]
+    clips = [part[..., REGIONS[region]] for part in (*ours, *theirs)]
     sizes = [len(part) for part in clips]
     dyad = np.repeat(np.tile(np.arange(len(ours)), 2), sizes)
     label = np.repeat(np.repeat([1, 0], len(ours)), sizes)

@@ -274,7 +274,7 @@ def _motions(condition: str, voices: Sequence[_StudyVoice], seed: int) -> list[F
     """Return the motion (N, 58) to every voice."""
     if condition == RECORDED:
         return [each.recorded for each in voices if each.recorded is not None]
-    listener = load_listener(find("listeners", condition, "config.yaml"))
+    listener = load_listener(condition)
     return [
         rollout(listener, each.frames, [seed + _HOPS * number]).motion[0, -(len(each.audio) // FRAME_SAMPLES) :]
         for number, each in enumerate(voices)

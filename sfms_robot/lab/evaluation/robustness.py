@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.signal import oaconvolve
 
 from sfms_robot.app.progress import tracked
-from sfms_robot.config import Calmness, find
+from sfms_robot.config import Calmness
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import (
@@ -84,12 +84,11 @@ def evaluate_robustness(
     """
     if split == "train":
         raise ConfigError("--split train: listeners were trained on these voices; validation and test are others")
-    folder = find("listeners", name, "config.yaml")
-    load_listener(folder)  # report its errors here, not from a process
+    load_listener(name)  # report its errors here, not from a process
     voices = voice_folders(data)
     everybody = unseen(voices, split)[:speakers]
     tasks = [(place, inputs, number) for place in range(len(everybody)) for inputs, number in cases()]
-    work = partial(_play, folder, voices, split, minutes, range(seed, seed + seeds))
+    work = partial(_play, name, voices, split, minutes, range(seed, seed + seeds))
     rows = run_in_processes(work, tasks, jobs, "speakers heard")
     found: dict[str, Any] = {"returned_smiles": returned_smiles(voices, speakers, minutes, range(seed, seed + seeds))}
     for kind in RANGES:
@@ -116,7 +115,7 @@ def evaluate_robustness(
 
 
 def _play(
-    folder: Path, voices: tuple[Path, ...], split: Split, minutes: float, seeds: range, task: tuple[int, Inputs, int]
+    listener: str, voices: tuple[Path, ...], split: Split, minutes: float, seeds: range, task: tuple[int, Inputs, int]
 ) -> dict[str, Any]:
     """Play one speaker in one condition: places among the voices of `split`, and in `CONDITIONS`."""
     place, inputs, number = task
@@ -129,7 +128,7 @@ def _play(
         "inputs": inputs,
         "condition": condition.name,
         "tells_speech": inputs != "face" or condition.mouth_moves,
-        **rates(counted(rollout(_listener(folder), frames, seeds)), len(frames) / FRAME_HZ / 60, listened),
+        **rates(counted(rollout(_listener(listener), frames, seeds)), len(frames) / FRAME_HZ / 60, listened),
     }
 
 
@@ -146,6 +145,11 @@ class UnseenSpeaker:
     name: str
     voice: Floats
     face: Floats
+
+
+def motions_of(split: Split) -> Motions:
+    """Return the bundled motions of a part of the people."""
+    return read_motions(data_dir("sim") / "listeners" / "motions.npz")[split]
 
 
 def voice_folders(data: Path | None) -> tuple[Path, ...]:
@@ -170,7 +174,7 @@ def _kept(voices: tuple[Path, ...], split: Split) -> tuple[UnseenSpeaker, ...]:
 
     The face has the speaker's own mouth if it was filmed, else another's that opens with the voice.
     """
-    motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")[split]
+    motions = motions_of(split)
     kept = {voice.name: voice for voice in find_voices(voices) if split_of_voice(voice.name) == split}
 
     def speaker(number: int, name: str) -> UnseenSpeaker:
@@ -335,7 +339,7 @@ def returned_smiles(
     smiles with speakers who never smile; `false_per_minute`: those that follow a smile seen in their talking mouths.
     """
     people = [speaker for split in ("validation", "test") for speaker in _kept(voices, split)][:speakers]
-    model, motions = EventModel.load(), read_motions(data_dir("sim") / "listeners" / "motions.npz")["test"]
+    model, motions = EventModel.load(), motions_of("test")
     length_s, calm = 60 * max(minutes, LEAST_MINUTES), Calmness()
     answered, rates_a_minute, false = [], [], []
     for place, speaker in enumerate(tracked(people, "smiles returned")):

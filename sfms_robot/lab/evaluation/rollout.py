@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sfms_robot.app.progress import tracked
-from sfms_robot.config import find
 from sfms_robot.config.listener import paper_state
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, SpeakerFrame
@@ -51,7 +50,7 @@ def load_at_hop(name: str, hop: int | None = None, engine: EngineName = "torch")
 
     Raises ConfigError for a hop that it does not support, ModelError.
     """
-    listener = load_listener(find("listeners", name, "config.yaml"), engine=engine)
+    listener = load_listener(name, engine=engine)
     if hop is None:
         return listener
     if hop not in (choices := hops_of(listener)):
