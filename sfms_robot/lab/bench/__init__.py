@@ -9,17 +9,16 @@ from __future__ import annotations
 
 import importlib
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.errors import ConfigError, RobotError
 
 if TYPE_CHECKING:
-    from sfms_robot.lab.bench.measure import BenchResult
+    from sfms_robot.lab.bench.measure import BenchResult, Say
 
 ALL: Final = "all"
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ def measure_all(chosen: Mapping[str, Bench], say: Say) -> BenchResult:
         rows |= {name: each for name, each in found.figures.items() if isinstance(each, Mapping) and "median" in each}
         failed += [] if found.passed else [f"{key}: {line}" for line in found.lines]
         say(f"{key} took {time.monotonic() - began_s:.0f} s")
-    return replace(BenchResult.of_rows(rows), lines=failed, passed=not failed)
+    return BenchResult.of_rows(rows, failed, passed=not failed)
 
 
 def _measured(bench: Bench, given: Mapping[str, Any], say: Say) -> BenchResult:

@@ -13,14 +13,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
-from sfms_robot.emulator.launch import EmulatedServo, launch
+from sfms_robot.emulator.launch import launch
 from sfms_robot.lab.bench.measure import HEAD, Row, row, times
 from sfms_robot.runtime.clock import RealClock, tick_times
 
@@ -44,11 +44,10 @@ class Host:
 
 def bus() -> dict[str, Row]:
     """Return all rows; ours first, then the vendor SDK on the same servos."""
-    head = _changed(load_head(HEAD), read_deadline_ms=DEADLINE_MS)
-    return {
-        **_cpu(head),
-        "bus.one_silent": _one_silent(head),
-    }
+    head = load_head(HEAD)
+    patient = head.buses["main"].model_copy(update={"read_deadline_ms": DEADLINE_MS})
+    head = head.model_copy(update={"buses": {"main": patient}})
+    return {**_cpu(head), "bus.one_silent": _one_silent(head)}
 
 
 def _cpu(head: Head) -> dict[str, Row]:
@@ -56,7 +55,7 @@ def _cpu(head: Head) -> dict[str, Row]:
         calls = [times(call, _CALLS, time.process_time) for call in (host.write, host.tick)]
         return [*calls, _paced(host)[1]]
 
-    with launch(_plugged(head)) as chain:
+    with launch(emulated(head)["main"]) as chain:
         with _ours(head, chain.device) as host:
             ours = measured(host)
         with _vendor(head, chain.device) as host:
@@ -72,7 +71,7 @@ def _cpu(head: Head) -> dict[str, Row]:
 def _one_silent(head: Head) -> Row:
     """Measure while the servo in the middle of the chain is dead."""
     ids = _ids(head)
-    with launch(_plugged(head)) as chain:
+    with launch(emulated(head)["main"]) as chain:
         with _ours(head, chain.device) as host:
             host.tick()
             chain.kill(ids[len(ids) // 2])
@@ -105,7 +104,7 @@ def _paced(host: Host) -> tuple[list[float], list[float]]:
 def _ours(head: Head, device: str) -> Iterator[Host]:
     """Open the bus that `run` uses."""
     clock = RealClock()
-    bus = build_bus(head, {next(iter(head.buses)): device}, clock)
+    bus = build_bus(head, {"main": device}, clock)
     bus.connect()
     held = bus.enable(list(head.joints))
     joints = head.joints.values()  # without power the joints sag out of their ranges: they move in first
@@ -132,7 +131,7 @@ def _vendor(head: Head, device: str) -> Iterator[Host]:
 
     port, protocol = sdk.PortHandler(device), sdk.PacketHandler(2.0)
     port.openPort()
-    port.setBaudRate(next(iter(head.buses.values())).baud)
+    port.setBaudRate(head.buses["main"].baud)
     writer = sdk.GroupSyncWrite(port, protocol, *_GOAL)
     reader = sdk.GroupSyncRead(port, protocol, *_POSITION)
     ids, middle = _ids(head), list(_MIDDLE)
@@ -153,16 +152,6 @@ def _vendor(head: Head, device: str) -> Iterator[Host]:
         yield Host(write, tick)
     finally:
         port.closePort()
-
-
-def _changed(head: Head, **values: Any) -> Head:
-    """Return the head with other values of its only bus."""
-    name, config = next(iter(head.buses.items()))
-    return head.model_copy(update={"buses": {name: config.model_copy(update=values)}})
-
-
-def _plugged(head: Head) -> list[EmulatedServo]:
-    return emulated(head)[next(iter(head.buses))]
 
 
 def _ids(head: Head) -> list[int]:

@@ -43,7 +43,7 @@ from sfms_robot.lab.bench.campaign_rig import (
     head_of,
     plugged_in,
 )
-from sfms_robot.lab.bench.measure import BenchResult
+from sfms_robot.lab.bench.measure import BenchResult, Say
 from sfms_robot.servo.port import WrappedPort
 
 _TICKS: Final = 1000
@@ -142,7 +142,7 @@ class SilencePort(WrappedPort):
         return data
 
 
-def measure(say: Callable[[str], None]) -> BenchResult:
+def measure(say: Say) -> BenchResult:
     """Run the whole campaign as a bench."""
     logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of expected faults
     outcomes = run_campaign(progress=say)

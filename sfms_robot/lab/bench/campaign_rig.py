@@ -9,8 +9,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from sfms_robot.app.open_head import build_bus
-from sfms_robot.app.wiring import calibration_of, emulated, firmware_maps, port_of
+from sfms_robot.app.open_head import build_bus, bus_servos
+from sfms_robot.app.wiring import calibration_of, emulated, port_of
 from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
@@ -19,9 +19,7 @@ from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.ports import Bus
 from sfms_robot.runtime.clock import VirtualClock
 from sfms_robot.servo.families import family_named
-from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
-from sfms_robot.servo.registers import Table
 
 RATE_HZ: Final = 100.0
 LIMIT_DEG: Final = 40.0
@@ -170,8 +168,10 @@ class Judge:
         shafts = rig.conversion.to_rad(np.array([state["position"] for state in states]))
         self._shafts.append(shafts)
         for index, state in enumerate(states):
-            if state["torque"] and state["goal"] is not None:
-                self._see_goal(index, state["goal"])
+            if state["torque"] and (goal := state["goal"]) is not None:
+                self.outside += not self._low[index] <= goal <= self._high[index]
+                self._low[index] = max(self._low[index], min(goal, rig.conversion.low_ticks[index]))
+                self._high[index] = min(self._high[index], max(goal, rig.conversion.high_ticks[index]))
                 if rig.tick_us:
                     self.pulses_us.append(state["pulse"] * rig.tick_us)
         for index, reading in enumerate(readings.values()):
@@ -187,11 +187,6 @@ class Judge:
     def recovered_s(self, end_s: float) -> float | None:
         """Return the time from `end_s`, the end of the fault, until all was well for good; None if it never was."""
         return None if self.well_since_s is None else max(0.0, self.well_since_s - end_s)
-
-    def _see_goal(self, index: int, goal: float) -> None:
-        self.outside += not self._low[index] <= goal <= self._high[index]
-        self._low[index] = max(self._low[index], min(goal, self._rig.conversion.low_ticks[index]))
-        self._high[index] = min(self._high[index], max(goal, self._rig.conversion.high_ticks[index]))
 
     def _misdated(self, index: int, reading: Reading) -> bool:
         """Return whether the servo was elsewhere at the time that the reading states."""
@@ -230,15 +225,10 @@ def plugged_in(
 
 def _bus_on(head: Head, chains: Mapping[str, Chain], clock: VirtualClock, wrap: Callable[[Port], Port]) -> Bus:
     [(name, config)] = head.buses.items()
-    maps = firmware_maps(head.joints)
-    servos = [
-        BusServo(joint=key, id=j.id, table=Table.of(maps[j.model]), min_rad=j.min_rad, max_rad=j.max_rad)
-        for key, j in head.joints.items()
-    ]
     open_port, family = port_of(chains[name], config, clock), family_named(config.family)
     more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
     bus: Bus = family.build(
-        name, servos, calibration_of(head.joints), lambda: wrap(open_port()), config.baud, _DEADLINE_S,
-        config=config, **more,
+        name, bus_servos(head, head.joints), calibration_of(head.joints), lambda: wrap(open_port()), config.baud,
+        _DEADLINE_S, config=config, **more,
     )  # fmt: skip
     return bus

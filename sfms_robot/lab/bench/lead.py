@@ -17,7 +17,6 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.open_head import open_head
@@ -33,6 +32,7 @@ from sfms_robot.lab.bench.measure import HEAD, Row, row
 from sfms_robot.ports import Clock, Observer, Tick
 from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.safety import Interrupt
+from sfms_robot.signals.events import Bools
 
 _HORIZON, _HOP = 8, 4  # frames of a plan, and between two plans
 _LATENCY_S: Final = 0.010  # from the last frame heard to the plan
@@ -61,8 +61,8 @@ class Waves:
 
     lost = False
 
-    def __init__(self, seed: int = 0) -> None:
-        rng = np.random.default_rng(seed)
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
         self._rates = 2 * np.pi * rng.uniform(*_RANGE_HZ, (_WAVES, MOTION_DIM))
         self._phases = rng.uniform(0, 2 * np.pi, (_WAVES, MOTION_DIM))
         self._centre = np.full(MOTION_DIM, 0.3)
@@ -170,7 +170,7 @@ def delay_ticks(meant: Doubles, seen: Doubles, farthest: int) -> Doubles:
     best = np.clip(np.argmax(likeness, axis=0), 1, len(likeness) - 2)
     before, here, after = (likeness[best + k, np.arange(meant.shape[1])] for k in (-1, 0, 1))
     bend = before - 2 * here + after
-    moved: NDArray[np.bool_] = (np.ptp(meant, axis=0) > _MOVED_RAD) & (np.ptp(seen, axis=0) > _MOVED_RAD) & (bend < 0)
+    moved: Bools = (np.ptp(meant, axis=0) > _MOVED_RAD) & (np.ptp(seen, axis=0) > _MOVED_RAD) & (bend < 0)
     between = 0.5 * (before - after) / np.where(moved, bend, 1.0)
     return np.where(moved, best - farthest + between, np.nan)
 

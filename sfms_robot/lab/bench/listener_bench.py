@@ -94,19 +94,15 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
         rows[f"{name} {way}"]["distance"] = distance(loaded[way], loaded[EAGER], speaker)
         rows[f"{name} {way}"] |= asdict(listener_process(*ways[way]))
     auto = [*ways][-1]
+    how: Any = getattr(loaded[EAGER], "how", loaded[EAGER])  # of a listener that may also decide events
     rows[name] = rows[f"{name} {auto}"] | {
         "eager_fp32_fps": rows[f"{name} {EAGER}"]["fps"],
-        "params": sum(each.numel() for each in _how(loaded[EAGER]).model.parameters()),
+        "params": sum(each.numel() for each in how.model.parameters()),
         "weights": weights,
     }
     if isinstance(settings, config.Arig):
         rows[name]["in_run"] = in_run(folder)
     return rows
-
-
-def _how(listener: Listener) -> Any:
-    """Return the model of motion of a listener that may also decide events."""
-    return getattr(listener, "how", listener)
 
 
 def with_weights(name: str, scratch: Path) -> tuple[Path, str]:
@@ -118,7 +114,6 @@ def with_weights(name: str, scratch: Path) -> tuple[Path, str]:
     import torch
 
     from sfms_robot.listeners.arig.model import ArigModel
-    from sfms_robot.listeners.engine import FOLDER, has_graphs
 
     with torch.random.fork_rng():
         torch.manual_seed(0)

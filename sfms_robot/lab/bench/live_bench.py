@@ -21,7 +21,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,7 +41,7 @@ from sfms_robot.emulator.sound_server import SoundServer
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ
 from sfms_robot.lab.bench.live_stamps import ResidentMemory, StampedSource, Stamps
-from sfms_robot.lab.bench.measure import HEAD, LISTENER, BenchResult, package_environment, result_of
+from sfms_robot.lab.bench.measure import HEAD, LISTENER, BenchResult, Say, package_environment, result_of
 from sfms_robot.lab.bench.startup_bench import first_goal_s
 from sfms_robot.ports import Source
 from sfms_robot.processes import realtime_priority
@@ -60,15 +60,13 @@ GOALS: Final[Mapping[str, float]] = {  # upper limits, except the share of ticks
     "face_to_goal_p95_ms": 80, "first_write_s": 2.2,
 }  # fmt: skip
 _MINUTES: Final = 10.0
-_IDLE_S: Final = 5.0
+_IDLE_S, _IDLE_HZ = 5.0, 100.0
 _FILE_S: Final = 60.0
 _STARTS: Final = 5
 _BUSY_JITTER_MS: Final = 0.5  # of an empty loop, p99
 _PIECE: Final = 160  # samples that are pushed at once
 _MEMORY_LOOKS: Final = 200
 _CHILD: Final = "from sfms_robot.lab.bench.live_bench import measured_run; measured_run()"
-
-Say = Callable[[str], None]
 
 
 def live(minutes: float, audio: Audio, say: Say) -> BenchResult:
@@ -97,14 +95,14 @@ def live(minutes: float, audio: Audio, say: Say) -> BenchResult:
     return BenchResult({**result, "goals": found}, table, _lines(result))
 
 
-def idle_loop(duration_s: float, rate_hz: float = 100.0) -> dict[str, Any]:
-    """Measure the jitter of a loop that does nothing, at the priority of a run, and the load. Blocks."""
+def idle_loop(duration_s: float) -> dict[str, Any]:
+    """Measure the jitter of a loop of 100 Hz that does nothing, at the priority of a run, and the load. Blocks."""
     clock, late_ms = RealClock(), Quantiles()
     with realtime_priority(wanted=True) as priority:
-        for tick in tick_times(clock, rate_hz, clock.now_s()):
+        for tick in tick_times(clock, _IDLE_HZ, clock.now_s()):
             if tick.time_s > duration_s:
                 break
-            late_ms.add((tick.late_s + tick.skipped / rate_hz) * 1e3)
+            late_ms.add((tick.late_s + tick.skipped / _IDLE_HZ) * 1e3)
     jitter_ms = late_ms.report(p50=50, p99=99, max=100)
     busy = late_ms.at(99) > _BUSY_JITTER_MS or load() > (os.cpu_count() or 1) / 2
     return {"jitter_ms": jitter_ms, "busy": busy, "load": load(), "cores": os.cpu_count(), "priority": priority}
@@ -125,14 +123,13 @@ def goals(result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         "face_to_goal_p95_ms": live["face_to_goal_ms"]["p95"],
         "first_write_s": result["first_write_s"],
     }
-
-    def met(name: str, wanted: float) -> bool | None:
-        if (value := came[name]) is None:
-            return None
-        return bool(value >= wanted if name == "in_time_share" else value <= wanted)
-
     return {
-        name: {"measured": came[name], "wanted": wanted, "met": met(name, wanted)} for name, wanted in GOALS.items()
+        name: {
+            "measured": (value := came[name]),
+            "wanted": wanted,
+            "met": None if value is None else value >= wanted if name == "in_time_share" else value <= wanted,
+        }
+        for name, wanted in GOALS.items()
     }
 
 

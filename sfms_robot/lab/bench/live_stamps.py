@@ -34,17 +34,16 @@ _REMEMBERED: Final = 100  # frames
 
 
 class StampedSource(Source):
-    """A source that knows the loop's origin on the clock `now`."""
+    """A source that knows the loop's origin on `time.monotonic`."""
 
-    def __init__(self, inner: Source, now: Callable[[], float] = time.monotonic) -> None:
-        self._inner, self._now = inner, now
-        self._origin_s = 0.0
+    def __init__(self, inner: Source) -> None:
+        self._inner, self._origin_s = inner, 0.0
         self.duration_s = inner.duration_s
         self.latency_s, self.missing, self.outlets = inner.latency_s, inner.missing, inner.outlets
 
     def loop_s(self) -> float:
         """Return the loop time."""
-        return self._now() - self._origin_s
+        return time.monotonic() - self._origin_s
 
     def start(self, origin_s: float) -> None:
         self._origin_s = origin_s

@@ -27,6 +27,7 @@ from sfms_robot.processes import cores
 HEAD: Final = "face28"
 LISTENER: Final = "sfms-small"
 Row = dict[str, Any]
+Say = Callable[[str], None]  # prints a line of progress
 # -P: the current folder of the caller must not shadow the installation that is measured.
 MAIN: Final = ("-P", "-c", "from sfms_robot.cli.main import main; main()")
 _PAGE: Final = """# Measured by `sfms-robot bench`
@@ -55,12 +56,17 @@ class BenchResult:
     passed: bool = True
 
     @classmethod
-    def of_rows(cls, rows: Mapping[str, Row]) -> BenchResult:
-        """Return the result of a bench whose figures are rows; each row gets the name of this machine."""
+    def of_rows(
+        cls, rows: Mapping[str, Row], lines: Sequence[str] = (), passed: bool = True, **more: Any
+    ) -> BenchResult:
+        """Return the result of a bench whose figures are rows, and `more`; each row gets the name of this machine."""
         rows = {name: {**each, "machine": machine()} for name, each in rows.items()}
-        columns = {"median": "median", "unit": "unit", "p99": "p99", "ratio": "ratio", "peer": "to"}
-        table = [{"measured": name} | {columns[key]: each.get(key) for key in columns} for name, each in rows.items()]
-        return cls(rows, table)
+        shown = ("median", "unit", "p99", "ratio")
+        table = [
+            {"measured": name, **{key: each.get(key) for key in shown}, "to": each.get("peer")}
+            for name, each in rows.items()
+        ]
+        return cls({**rows, **more}, table, lines, passed)
 
 
 def machine() -> str:
@@ -107,6 +113,8 @@ def times(call: Callable[[], object], count: int, clock: Callable[[], float] = t
 
 # --- another installation -------------------------------------------------------------------------------------------
 
+_COMPARED: Final = 3  # runs of each
+
 
 def environment(folder: Path) -> Mapping[str, str]:
     """Return an environment in which Python finds the package in `folder` first. Raises ConfigError without one."""
@@ -115,7 +123,7 @@ def environment(folder: Path) -> Mapping[str, str]:
     return {**os.environ, "PYTHONPATH": str(folder.resolve())}
 
 
-def compare_installations(name: str, against: Path, repeats: int = 3) -> dict[str, Row]:
+def compare_installations(name: str, against: Path) -> dict[str, Row]:
     """Run `bench NAME` of this installation and of the one in `against` in turn; return the rows that both have.
 
     Raises ConfigError if the other installation does not run, or the bench has no rows.
@@ -123,7 +131,7 @@ def compare_installations(name: str, against: Path, repeats: int = 3) -> dict[st
     ours: dict[str, list[float]] = {}
     theirs: dict[str, list[float]] = {}
     units: dict[str, str] = {}
-    for _ in range(repeats):
+    for _ in range(_COMPARED):
         for found, env in ((ours, None), (theirs, environment(against))):
             done = subprocess.run(
                 [sys.executable, *MAIN, "bench", name, "--json"],

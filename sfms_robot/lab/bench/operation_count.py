@@ -15,22 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
-from torch.utils.flop_counter import FlopCounterMode, sdpa_backward_flop_count, sdpa_flop_count
-
-
-def _attention(query: Any, key: Any, value: Any, *_: Any, **__: Any) -> int:
-    return int(sdpa_flop_count(query, key, value))  # type: ignore[no-untyped-call]
-
-
-def _attention_backward(gradient: Any, query: Any, key: Any, value: Any, *_: Any, **__: Any) -> int:
-    return int(sdpa_backward_flop_count(gradient, query, key, value))  # type: ignore[no-untyped-call]
-
-
-_CPU_ATTENTION = {  # torch has the formulas for other devices' kernels alone
-    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _attention,
-    torch.ops.aten._scaled_dot_product_flash_attention_for_cpu_backward: _attention_backward,
-}
-
+from torch.utils.flop_counter import FlopCounterMode
 
 _DRAWING = ("rand", "normal", "uniform", "exponential", "bernoulli", "multinomial")
 
@@ -46,8 +31,14 @@ class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
 
     def __init__(self) -> None:
         super().__init__()  # type: ignore[no-untyped-call]
-        self._products = FlopCounterMode(display=False, custom_mapping=_CPU_ATTENTION)
-        self._known: set[Any] = set(self._products.flop_registry)
+        self._products = FlopCounterMode(display=False)
+        aten, self._known = torch.ops.aten, self._products.flop_registry
+        self._known |= {  # torch has the formulas of attention for other devices' kernels alone
+            aten._scaled_dot_product_flash_attention_for_cpu: self._known[aten._scaled_dot_product_flash_attention],
+            aten._scaled_dot_product_flash_attention_for_cpu_backward: self._known[
+                aten._scaled_dot_product_flash_attention_backward
+            ],
+        }
         self.other = self.bytes = self.calls = self.drawn = 0
 
     @property

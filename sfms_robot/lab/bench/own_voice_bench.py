@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import correlate, fftconvolve, lfilter
 
 from sfms_robot.data import data_dir
@@ -24,9 +23,8 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, Doubles, Floats
 from sfms_robot.lab.bench.measure import BenchResult
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.echo import EchoCanceller
+from sfms_robot.signals.events import Bools
 from sfms_robot.signals.own_voice_gate import WINDOW, OwnVoiceGate, SpeechProbability
-
-Bools = NDArray[np.bool_]
 
 # Parameters were chosen on these calls, which are never reported on, with other gears (seed 1) and other movements.
 CHOSEN_ON: Final = ("hvb_01cefd6f5c044a6f", "hvb_02e41649e7c441fd", "hvb_03a17cc36d474151")

@@ -30,7 +30,7 @@ from sfms_robot.app.serve.service import WorkerPool
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.lab.bench.listener_bench import NAMES, with_weights
-from sfms_robot.lab.bench.measure import BenchResult, machine
+from sfms_robot.lab.bench.measure import BenchResult, Say, machine
 from sfms_robot.listeners.engine import Device
 from sfms_robot.listeners.registry import engine_name, load_listener
 from sfms_robot.listeners.remote_messages import (
@@ -53,14 +53,15 @@ _SECONDS: Final = 4.0
 _MOST: Final = 512
 GPU_HEADS: Final = (64, 256, 1024)
 GPU_NAMES: Final = ("arig-small", "sfms-small")
+_BATCH_FRAMES: Final = 8
 _NOT_KEPT_UP_MS: Final = 10_000.0  # stands for a server that skipped frames
 _ANSWER_S: Final = 30.0
 
 
-def measure(say: Callable[[str], None], device: Device = "cpu") -> BenchResult:
+def measure(say: Say, device: Device = "cpu") -> BenchResult:
     """Measure every listener. Blocks for some minutes."""
     if device != "cpu":
-        return on_gpu(say, device)
+        return _on_gpu(say, device)
     figures = {name: _served(name, say) for name in NAMES}
     table = [
         {
@@ -75,23 +76,17 @@ def measure(say: Callable[[str], None], device: Device = "cpu") -> BenchResult:
     return BenchResult(figures, table, [f"within {DEADLINE_S * 1e3:.0f} ms, p99, a process for each of {machine()}"])
 
 
-def on_gpu(
-    say: Callable[[str], None],
-    device: Device,
-    names: Sequence[str] = GPU_NAMES,
-    heads: Sequence[int] = GPU_HEADS,
-    processes: int | None = None,
-) -> BenchResult:
+def _on_gpu(say: Say, device: Device) -> BenchResult:
     """Measure listeners at fixed numbers of heads. Raises ConfigError where there is no GPU."""
     table, messages, where = list[dict[str, Any]](), _frames(), machine()
-    for name in names:
+    for name in GPU_NAMES:
         listener = load_listener(name, threads=1, device=device)
         where = f"{engine_name(listener)}, {machine()}"
-        batches = {count: batch_ms(listener, count) for count in heads}
+        batches = {count: _batch_ms(listener, count) for count in GPU_HEADS}
         load = _Load()
         served = Served(listener=name, name="bench", all_heads=True, device=device)
-        with closing(WorkerPool(served, load.sent, processes)) as pool:
-            for count in heads:
+        with closing(WorkerPool(served, load.sent)) as pool:
+            for count in GPU_HEADS:
                 point = {"listener": name, "hop": pool.hop, "processes": len(pool.capacities)}
                 point |= _loaded(pool, load, messages, count) | batches[count]
                 table.append(point)
@@ -102,7 +97,7 @@ def on_gpu(
     return BenchResult(figures, table, [f"within {DEADLINE_S * 1e3:.0f} ms is in time; on {where}"])
 
 
-def batch_ms(listener: Any, heads: int, frames: int = 8) -> dict[str, float]:
+def _batch_ms(listener: Any, heads: int) -> dict[str, float]:
     """Return what a batch of one frame of `heads` heads takes, on average over plans: in its networks, and in all."""
     engine, spent_s = listener.engine, list[float]()
     run = engine.run
@@ -117,8 +112,8 @@ def batch_ms(listener: Any, heads: int, frames: int = 8) -> dict[str, float]:
     voices = np.random.default_rng(0).normal(0, 0.1, (heads, FRAME_SAMPLES)).astype(np.float32)
     engine.run = timed
     try:
-        for index in range(2 * frames):  # half of them warm up
-            if index == frames:
+        for index in range(2 * _BATCH_FRAMES):  # half of them warm up
+            if index == _BATCH_FRAMES:
                 spent_s.clear()
                 began_s = time.perf_counter()
             speakers = [SpeakerFrame((index + 1) * FRAME_S, voice) for voice in voices]
@@ -126,10 +121,11 @@ def batch_ms(listener: Any, heads: int, frames: int = 8) -> dict[str, float]:
         whole_s = time.perf_counter() - began_s
     finally:
         engine.run = run
-    return {"batch_ms": round(whole_s / frames * 1e3, 2), "networks_ms": round(sum(spent_s) / frames * 1e3, 2)}
+    batch_ms, networks_ms = (round(taken_s / _BATCH_FRAMES * 1e3, 2) for taken_s in (whole_s, sum(spent_s)))
+    return {"batch_ms": batch_ms, "networks_ms": networks_ms}
 
 
-def _served(name: str, say: Callable[[str], None]) -> dict[str, Any]:
+def _served(name: str, say: Say) -> dict[str, Any]:
     messages, curve = _frames(), list[dict[str, Any]]()
     with tempfile.TemporaryDirectory() as scratch:
         folder, weights = with_weights(name, Path(scratch))
@@ -206,7 +202,8 @@ def _loaded(pool: WorkerPool, load: _Load, messages: Sequence[bytes], heads: int
             ahead_s = began_s + number * FRAME_S + phases_s[index] - time.monotonic()
             if ahead_s > 0:
                 time.sleep(ahead_s)
-            pool.receive(stream, _numbered(messages[(number + shifts[index]) % len(messages)], number))
+            message = messages[(number + shifts[index]) % len(messages)]  # number and time follow kind, protocol, flags
+            pool.receive(stream, message[:4] + struct.pack("<Id", number, (number + 1) * FRAME_S) + message[16:])
     sent_s = time.monotonic() - began_s
     now = pool.statistics()
     spent = {name: now[name] - before[name] for name in ("steps", "batches", "cpu_s")}
@@ -267,8 +264,3 @@ def _frames() -> list[bytes]:
     audio = read_audio(file)
     chunks = audio[: len(audio) // FRAME_SAMPLES * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
     return [frame_message(SentFrame(0, SpeakerFrame(FRAME_S, chunk), 0.0)) for chunk in chunks]
-
-
-def _numbered(message: bytes, number: int) -> bytes:
-    """Return the message with another number and time, which follow kind, protocol and flags."""
-    return message[:4] + struct.pack("<Id", number, (number + 1) * FRAME_S) + message[16:]

@@ -22,7 +22,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -42,6 +42,7 @@ from sfms_robot.lab.bench.measure import (
     HEAD,
     LISTENER,
     BenchResult,
+    Say,
     children_of,
     package_environment,
     result_of,
@@ -93,7 +94,7 @@ class ObservedRun:
         return {"in_time": in_time, "rate": rate_hz, "plans": len(self.plans_s) / self.report["duration_s"]}
 
 
-def measure(say: Callable[[str], None]) -> BenchResult:
+def measure(say: Say) -> BenchResult:
     """Measure both runs; takes a minute.
 
     Raises ConfigError if processes cannot be held here, BusError if a run fails.
@@ -109,13 +110,11 @@ def measure(say: Callable[[str], None]) -> BenchResult:
         f"throttle.{name}": row([value], [peers[name]], units[name], "the same run on all cores")
         for name, value in held.figures().items()
     }
-    found = BenchResult.of_rows(rows)
     seconds = held.report["states"]["seconds"]
     states = {name: round(100 * of_s / sum(seconds.values()), 1) for name, of_s in seconds.items()}
     lines = [f"states on {SHARE:g} of one core, % of the time: {states}"]
     lines += problems or ["commands inside limits, states as docs/safety.md says"]
-    figures = {**found.figures, "share": SHARE, "problems": problems, "states": states}
-    return BenchResult(figures, found.table, lines, not problems)
+    return BenchResult.of_rows(rows, lines, passed=not problems, share=SHARE, problems=problems, states=states)
 
 
 # --- problems -------------------------------------------------------------------------------------------------------

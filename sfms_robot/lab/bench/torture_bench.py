@@ -40,7 +40,6 @@ from sfms_robot.lab.bench.live_bench import (
     SINK,
     Audio,
     LivePerson,
-    Say,
     check_audio,
     free_port,
     idle_loop,
@@ -50,7 +49,7 @@ from sfms_robot.lab.bench.live_bench import (
     patient_head,
 )
 from sfms_robot.lab.bench.live_stamps import listener_of
-from sfms_robot.lab.bench.measure import HEAD, LISTENER, MAIN, BenchResult, package_environment
+from sfms_robot.lab.bench.measure import HEAD, LISTENER, MAIN, BenchResult, Say, package_environment
 
 KINDS: Final = ("killed", "stopped", "cut", "unplugged")
 LONGEST_S: Final[Mapping[str, float]] = {"killed": 1.0, "stopped": 1.0, "cut": 1.0, "unplugged": 1.5}
@@ -62,6 +61,7 @@ _AWAY_S: Final = 3.0  # of a source or a servo
 _START_S: Final = 60.0
 _AFTER_S: Final = 2.0  # ticks missed within this time after a blow belong to it
 _END_S: Final = 30.0
+_SEED: Final = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ def measure(say: Say, minutes: float = 0.0, audio: Audio = "mic", torture: bool 
     return BenchResult(result, table, lines, result["passed"])
 
 
-def tortured(minutes: float, audio: Audio, say: Say, seed: int = 0) -> dict[str, Any]:
+def tortured(minutes: float, audio: Audio, say: Say) -> dict[str, Any]:
     """Run for `minutes` with faults in proportion to the time; Linux only. Blocks.
 
     Raises ConfigError without PulseAudio, BusError if the run does not begin.
@@ -112,14 +112,14 @@ def tortured(minutes: float, audio: Audio, say: Say, seed: int = 0) -> dict[str,
     check_audio(audio)
     idle = idle_loop(3.0)
     order = [kind for kind in KINDS for _ in range(max(1, round(_EACH * minutes / _MINUTES)))]
-    random.Random(seed).shuffle(order)
+    random.Random(_SEED).shuffle(order)
     head = load_head(HEAD)
     with TemporaryDirectory() as name, live_person(Path(name), audio) as person:
         folder = Path(name)
         with launch(emulated(head)["main"], timing="wire") as chain:
             with _running(folder, chain, person, audio) as (process, port):
                 victim = _Victim(process=process, port=port, chain=chain, head=head, person=person)
-                blows = _strike(victim, order, minutes * 60, seed, say)
+                blows = _strike(victim, order, minutes * 60, say)
                 report = _ended(process, folder)
             torque = [servo.id for servo in chain.servos if chain.state(servo.id)["torque"]]
         result = _judged(blows, report, folder / "run", torque)
@@ -180,9 +180,9 @@ def _status(port: int) -> dict[str, Any]:
     return document
 
 
-def _strike(victim: _Victim, order: Sequence[str], duration_s: float, seed: int, say: Say) -> list[Blow]:
+def _strike(victim: _Victim, order: Sequence[str], duration_s: float, say: Say) -> list[Blow]:
     """Cause each fault in its slot of the time, at a random moment in the first fifth of the slot."""
-    chance, slot_s = random.Random(seed), duration_s / len(order)
+    chance, slot_s = random.Random(_SEED), duration_s / len(order)
     blows = []
     for number, kind in enumerate(order):
         ends_s = time.monotonic() + slot_s

@@ -8,7 +8,6 @@ windows and noise, cuts and changes them, clips and updates. Steps are those of 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +17,7 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 
 from sfms_robot.config import load_training
 from sfms_robot.data import data_dir
-from sfms_robot.lab.bench.measure import BenchResult, Row, row
+from sfms_robot.lab.bench.measure import BenchResult, Row, Say, row
 from sfms_robot.lab.learning.dry_run import jobs_of
 from sfms_robot.lab.learning.job import Job, ProcessGroup
 from sfms_robot.lab.learning.training_loop import Gradients, make_step
@@ -28,7 +27,7 @@ STEPS: Final = 12  # measured, after one that is not
 MOST_BESIDE: Final = {"arig": 0.15}  # share of a step, by job
 
 
-def measure(say: Callable[[str], None], steps: int = STEPS) -> BenchResult:
+def measure(say: Say, steps: int = STEPS) -> BenchResult:
     """Measure every job of the shipped files. Blocks for half a minute."""
     threads, rows = torch.get_num_threads(), dict[str, Row]()
     torch.set_num_threads(1)
@@ -41,8 +40,7 @@ def measure(say: Callable[[str], None], steps: int = STEPS) -> BenchResult:
         torch.set_num_threads(threads)
     missed = [name for name, most in MOST_BESIDE.items() if rows[f"train.{name}"]["ratio"] > most]
     lines = [f"{name}: more than {MOST_BESIDE[name]:.0%} of a step is not the model" for name in missed]
-    found = BenchResult.of_rows(rows)
-    return BenchResult(found.figures, found.table, lines, not missed)
+    return BenchResult.of_rows(rows, lines, passed=not missed)
 
 
 def _measured(job: Job, steps: int) -> Row:

@@ -17,7 +17,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Final
@@ -30,7 +30,7 @@ from sfms_robot.app.options import RunOptions, begin_page
 from sfms_robot.app.session import run
 from sfms_robot.endpoint import LOOPBACK
 from sfms_robot.errors import BusError, ConfigError
-from sfms_robot.lab.bench.measure import HEAD, BenchResult, processor_time_s, row
+from sfms_robot.lab.bench.measure import HEAD, BenchResult, Say, processor_time_s, row
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.processes import Child, ParentPipe
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
@@ -49,15 +49,15 @@ _LIMIT_S: Final = 60.0
 _CLOSE_S: Final = 5.0
 
 
-def measure(say: Callable[[str], None], windows: int = _WINDOWS, halts: int = _HALTS) -> BenchResult:
+def measure(say: Say) -> BenchResult:
     """Measure a run with clients; takes a minute and a half. Linux only.
 
     Raises ConfigError elsewhere, BusError when the run ends early.
     """
     if not Path("/proc/self/stat").is_file():
         raise ConfigError("bench view: processor time of the page's process is read from /proc (Linux)")
-    say(f"{windows} times {_WINDOW_S:g} s with {_CLIENTS} clients, then {halts} halts")
-    duration_s = _SETTLE_S + windows * _WINDOW_S + (halts + 1) * _BETWEEN_S + 1
+    say(f"{_WINDOWS} times {_WINDOW_S:g} s with {_CLIENTS} clients, then {_HALTS} halts")
+    duration_s = _SETTLE_S + _WINDOWS * _WINDOW_S + (_HALTS + 1) * _BETWEEN_S + 1
     page = begin_page("0")
     assert page is not None
     shares: list[float] = []
@@ -66,9 +66,10 @@ def measure(say: Callable[[str], None], windows: int = _WINDOWS, halts: int = _H
 
     def visit() -> None:
         if watch.settled.wait(_LIMIT_S):
-            for _ in range(windows):
-                shares.append(_share(lambda: processor_time_s(page.process_id) + _threads_s(THREAD)))
-            _click(page.url, watch, halts, halts_ms)
+            shares.extend(
+                _share(lambda: processor_time_s(page.process_id) + _threads_s(THREAD)) for _ in range(_WINDOWS)
+            )
+            halts_ms.extend(_halts_ms(page.url, watch))
 
     options = RunOptions(head=HEAD, audio=DEFAULT_SPEAKER, duration_s=duration_s)
     with closing(page), page_session(page, options) as pages:
@@ -78,16 +79,16 @@ def measure(say: Callable[[str], None], windows: int = _WINDOWS, halts: int = _H
         report = pages.run(observers=[watch])
         visitor.join(_LIMIT_S)
         readers.close(_CLOSE_S)
-    if report["exit"] != "done" or len(halts_ms) < halts:
+    if report["exit"] != "done" or len(halts_ms) < _HALTS:
         raise BusError(f"bench view: the run ended early: {report['exit']} {report['error'] or ''}")
     cost = row(shares, [_MOST_CPU], f"% of a core, {_CLIENTS} clients", "the share that is allowed")
     halt = row(halts_ms, [_MOST_HALT_MS], "ms", "the time that is allowed")
-    found = BenchResult.of_rows({"view.cpu": cost, "view.halt": halt})
     late = report["tick"]["late"]
-    return BenchResult({**found.figures, "late_ticks": late}, found.table, [f"{late} of {report['ticks']} ticks late"])
+    lines = [f"{late} of {report['ticks']} ticks late"]
+    return BenchResult.of_rows({"view.cpu": cost, "view.halt": halt}, lines, late_ticks=late)
 
 
-def outputs(say: Callable[[str], None], windows: int = _WINDOWS) -> BenchResult:
+def outputs(say: Say) -> BenchResult:
     """Measure a run without outputs, then with four, one of them read by clients; takes a minute and a half.
 
     The processor time is that of the outputs' threads. Linux only. Raises ConfigError, BusError.
@@ -106,16 +107,16 @@ def outputs(say: Callable[[str], None], windows: int = _WINDOWS) -> BenchResult:
         def read() -> None:
             if watch.settled.wait(_LIMIT_S):
                 readers = Child(f"{__name__}:clients", f"http://{LOOPBACK}:{places[0]}/", name="clients")
-                shares.extend(_share(lambda: _threads_s("output")) for _ in range(windows))
+                shares.extend(_share(lambda: _threads_s("output")) for _ in range(_WINDOWS))
                 readers.close(_CLOSE_S)
 
         reader = threading.Thread(target=read, daemon=True)
         reader.start()
         late = []
         for four, observers in (((), []), (chosen, [watch])):
-            say(f"{windows} times {_WINDOW_S:g} s with {len(four)} outputs")
+            say(f"{_WINDOWS} times {_WINDOW_S:g} s with {len(four)} outputs")
             options = RunOptions(
-                head=HEAD, audio=DEFAULT_SPEAKER, duration_s=_SETTLE_S + (windows + 1) * _WINDOW_S, outputs=four
+                head=HEAD, audio=DEFAULT_SPEAKER, duration_s=_SETTLE_S + (_WINDOWS + 1) * _WINDOW_S, outputs=four
             )
             report = run(options, observers=observers)
             if report["exit"] != "done":
@@ -124,8 +125,7 @@ def outputs(say: Callable[[str], None], windows: int = _WINDOWS) -> BenchResult:
         reader.join(_LIMIT_S)
     cost = row(shares, [_MOST_OUTPUTS_CPU], "% of a core, 4 outputs", "the share that is allowed")
     lines = [f"{late[1]:.3g} % of ticks late with four outputs, {late[0]:.3g} % without"]
-    found = BenchResult.of_rows({"outputs.cpu": cost})
-    return BenchResult({**found.figures, "late_percent": late[1], "late_percent_without": late[0]}, found.table, lines)
+    return BenchResult.of_rows({"outputs.cpu": cost}, lines, late_percent=late[1], late_percent_without=late[0])
 
 
 class _Watch(Observer):
@@ -162,17 +162,17 @@ def _share(used_s: Callable[[], float]) -> float:
     return 100 * (used_s() - before_s) / (time.monotonic() - began_s)
 
 
-def _click(url: str, watch: _Watch, halts: int, halts_ms: list[float]) -> None:
-    """Halt and resume the run `halts` times, and note the delay of each halt [ms]."""
+def _halts_ms(url: str, watch: _Watch) -> Iterator[float]:
+    """Halt and resume the run `_HALTS` times; yield the delay of each halt. Ends early when the run does."""
     with suppress(WebSocketException), _visitor(url) as visitor:
         threading.Thread(target=_read_all, args=(visitor,), daemon=True).start()
-        for _ in range(halts):
+        for _ in range(_HALTS):
             watch.halted.clear()
             clicked_s = time.monotonic()
             visitor.send('{"type": "halt"}')
             if not watch.halted.wait(1.0):
                 return
-            halts_ms.append((watch.halted_s - clicked_s) * 1e3)
+            yield (watch.halted_s - clicked_s) * 1e3
             visitor.send('{"type": "resume"}')
             time.sleep(_BETWEEN_S)
 
