@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfms_robot.frames import BLINKS, CHANNEL_INDEX, SMILE_CORNERS, Doubles
+from sfms_robot.frames import BLINKS, CHANNEL_INDEX, SMILE_CORNERS, Doubles, Indices
 
 Event = tuple[float, float, float]
 _NOD_RAD: Final = np.deg2rad(1.6)
@@ -110,7 +110,6 @@ def runs(mask: ArrayLike) -> list[tuple[int, int]]:
 # scipy takes 1.5 s and 60 MB to load, in a process that drives servos a hundred times a second. These functions give
 # the same numbers (tests compare them).
 
-Indices = NDArray[np.intp]
 
 _SETTLED: Final = 1e-12  # of what is left of a step when the filter counts as settled
 _EDGE: Final = 15  # samples mirrored at both ends, as scipy.signal.sosfiltfilt does for this order

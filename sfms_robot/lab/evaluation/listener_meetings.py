@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, ListenerEvent, SpeakerFrame, changed
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, Ints, ListenerEvent, SpeakerFrame, changed
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active, cast, heard, own_voice
 from sfms_robot.lab.corpora.compose.render_events import speaker_motion
@@ -30,8 +30,6 @@ SHIFT_S: Final = 60.0
 _SILENT_S: Final = 1.0  # a listener who spoke this recently does more than listen
 _FLOOR_S: Final = 1.0  # a phrase this long takes the floor
 _SIZES: Final[Mapping[str, float]] = {"nod": np.deg2rad(5.0), "gaze_shift": 0.4}  # assumed; others 0.5
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)

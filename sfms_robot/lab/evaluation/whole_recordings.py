@@ -16,16 +16,17 @@ from typing import Final
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
 from sfms_robot.config import Calmness
 from sfms_robot.frames import (
     EVENT_KINDS,
     FRAME_S,
     MOTION_DIM,
+    Bools,
     Doubles,
     FaceFrame,
     Floats,
+    Ints,
     ListenerEvent,
     SpeakerFrame,
     changed,
@@ -77,9 +78,6 @@ from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals import phase
 from sfms_robot.signals.audio import energies_db
 from sfms_robot.signals.event_sizes import SWING_S
-
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
 
 _TOGETHER: Final = 1000  # steps: as much as stays in a cache
 _MOST_NODS: Final = 1 + COUNTED_S / SWING_S[0]  # in the time in which they are counted

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_HZ, FRAME_S, Doubles, Floats
+from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, Ints
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
 from sfms_robot.lab.evaluation.intervals import Sums
@@ -30,7 +30,7 @@ from sfms_robot.lab.evaluation.phrase_timing import (
     rank_auc,
     ratio_of,
 )
-from sfms_robot.lab.evaluation.whole_recordings import Bools, Ints, Scene, counts_in, done_at, heard_in, unspoken
+from sfms_robot.lab.evaluation.whole_recordings import Scene, counts_in, done_at, heard_in, unspoken
 from sfms_robot.listeners.events.evidence import AT, HEARD, MINE, NUMBERS
 from sfms_robot.listeners.events.model import LEAD_FRAMES, LISTENING_S, STEP_FRAMES, STEP_S, Hazard
 from sfms_robot.signals import event_sizes as sizes
