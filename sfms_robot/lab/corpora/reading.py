@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, Dyad, samples_of
-from sfms_robot.lab.corpora.collection import ClipError
+from sfms_robot.lab.corpora.collection import ClipError, Kind
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import read_audio
 
@@ -96,10 +96,15 @@ def _has(module: str, name: str) -> bool:
         return False
 
 
+def present(problem: Kind, file: Path) -> None:
+    """Raise ClipError, as this problem, for a file that does not exist."""
+    if not file.is_file():
+        raise ClipError.of(problem, file, "no such file")
+
+
 def npy(file: Path) -> NDArray[Any]:
     """Map an array on disk into memory. Raises ClipError."""
-    if not file.is_file():
-        raise ClipError.of("missing half", file, "no such file")
+    present("missing half", file)
     try:
         out: NDArray[Any] = np.load(file, mmap_mode="r", allow_pickle=False)
     except UNREADABLE as error:
@@ -182,8 +187,7 @@ def track(name: str, values: NDArray[Any], frames: int, width: int, *, gaps: boo
 
 def sound(file: Path, frames: int, fps: float) -> Floats:
     """Return a voice cut to the length of its face, or padded if it ends a little early. Raises ClipError."""
-    if not file.is_file():
-        raise ClipError.of("missing sound", file, "no such file")
+    present("missing sound", file)
     audio, wanted = read_audio(file), samples_of(frames, fps)
     if wanted - len(audio) > SOUND_SLACK_S * AUDIO_HZ:
         detail = f"{len(audio) / AUDIO_HZ:.2f} s of sound for {frames / fps:.2f} s of face"
@@ -193,8 +197,7 @@ def sound(file: Path, frames: int, fps: float) -> Floats:
 
 def voices_of(*files: Path) -> list[Path]:
     """Return the files of a clip's voices. Raises ClipError if the speaker's, the first, is missing."""
-    if not files[0].is_file():
-        raise ClipError.of("missing sound", files[0], "no such file")
+    present("missing sound", files[0])
     return list(files)
 
 

@@ -33,7 +33,7 @@ from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.learning.job import Scratch
 from sfms_robot.listeners.idle import BANDS, BANDS_HZ, head_channels
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.control import control_track
+from sfms_robot.signals.control import COLUMNS, control_track
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 Frames = TypeVar("Frames", bound="DataclassInstance")
 
 GAZE = [CHANNEL_INDEX[name] for name in GAZE_CHANNELS]
+# Columns of control that say that an event other than a blink is under way.
+ACTIVE: Final = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
 SOUND_SAMPLE = 20_000  # frames whose sound gives means and deviations
 LEAST_SOUND_SPREAD = 1e-3
 

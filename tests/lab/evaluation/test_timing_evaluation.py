@@ -27,11 +27,7 @@ def spans(starts_s, length_s=0.6):
 def talk(seed=0):
     """(N,) talk in phrases of 1 to 8 s with pauses of 0.4 to 3 s."""
     rng = np.random.default_rng(seed)
-    pieces, total = [], 0
-    while total < FRAMES:
-        piece = np.r_[np.ones(rng.integers(25, 200), bool), np.zeros(rng.integers(10, 75), bool)]
-        pieces.append(piece)
-        total += len(piece)
+    pieces = [np.r_[np.ones(rng.integers(25, 200), bool), np.zeros(rng.integers(10, 75), bool)] for _ in range(1800)]
     return np.concatenate(pieces)[:FRAMES]
 
 
@@ -86,10 +82,8 @@ def test_people_judged_against_themselves_are_themselves():
 def test_nods_at_random_know_no_phrase_ends_and_rank_nothing():
     one = meeting(answering(talk()))
     runs = [spans(anywhere(4000, seed)) for seed in range(8)]
-    everything = np.ones(FRAMES, bool)
-    found = figures(
-        (one, timing.nod_sums("decided_", one, runs) | timing.nod_contingency("decided_", runs, one, everything))
-    )
+    contingency = timing.nod_contingency("decided_", runs, one, np.ones(FRAMES, bool))
+    found = figures((one, timing.nod_sums("decided_", one, runs) | contingency))
     assert found["decided_phrase_end_ratio"] == pytest.approx(1.0, abs=0.05)
     assert found["decided_nod_auc"] == pytest.approx(0.5, abs=0.05)
 
@@ -160,13 +154,10 @@ def history_hazard(one):
     return np.where((since > 0) & (since < 3 * FRAME_HZ), 1.0, 0.1)
 
 
-def shift(values):
-    return np.roll(values, round(timing.SHIFT_S * FRAME_HZ))
-
-
 def test_shifting_the_others_takes_all_from_a_listener_that_copies_their_phase():
     one = meeting(answering(talk()))
-    found = timing.contingent("", "x", phase_hazard(one.others), [phase_hazard(shift(one.others))], one)
+    other = np.roll(one.others, round(timing.SHIFT_S * FRAME_HZ))
+    found = timing.contingent("", "x", phase_hazard(one.others), [phase_hazard(other)], one)
     matched, shifted, difference = (numbers[0] / numbers[1] for numbers in found.values())
     assert matched > 0.9 and shifted == pytest.approx(0.5, abs=0.05)
     assert difference == pytest.approx(matched - shifted)
@@ -182,8 +173,7 @@ def test_shifting_the_others_takes_nothing_from_a_listener_that_follows_its_own_
 
 
 def test_moving_a_listeners_own_nods_tells_the_same():
-    one = meeting(answering(talk()))
-    everything = np.ones(FRAMES, bool)
+    one, everything = meeting(answering(talk())), np.ones(FRAMES, bool)
     runs = [spans(answering(talk(), seed=seed)) for seed in range(1, 9)]
     found = timing.nod_contingency("", runs, one, everything)
     assert found["nod_auc"][0] / found["nod_auc"][1] > 0.8
@@ -195,19 +185,15 @@ def test_moving_a_listeners_own_nods_tells_the_same():
 def test_too_short_a_part_cannot_be_shifted():
     one = meeting(answering(talk()))
     found = timing.nod_contingency("", [one.spans_s["nod"]], one, np.arange(FRAMES) < 90 * FRAME_HZ)
-    assert (
-        found["nod_auc"][1] > 0
-        and not found["shifted_nod_auc"].any()
-        and not found["nod_auc_matched_minus_shifted"].any()
-    )
+    assert found["nod_auc"][1] > 0
+    assert not any(found[name].any() for name in ("shifted_nod_auc", "nod_auc_matched_minus_shifted"))
 
 
 def test_an_instant_is_ranked_by_what_is_known_before_it():
     """A score that is high only once a nod has begun knows nothing of when it begins."""
     one = meeting(anywhere(200))
-    assert timing.ranked(one.inside("nod").astype(float), one)[0] / timing.ranked(np.zeros(FRAMES), one)[
-        1
-    ] == pytest.approx(0.5, abs=0.01)
+    score, nods = timing.ranked(one.inside("nod").astype(float), one)
+    assert score / nods == pytest.approx(0.5, abs=0.01)
     np.testing.assert_array_equal(meeting([10.0, 10.06]).instants("nod"), [249, 250])
 
 
@@ -269,9 +255,7 @@ def test_meetings_are_spread_evenly():
 
 
 def test_the_middle_of_a_meeting():
-    assert middle(30_000, 5.0) == (11_250, 7_500)
-    assert middle(100, 5.0) == (0, 100)
-    assert middle(100, 0.0)[1] == 0
+    assert (middle(30_000, 5.0), middle(100, 5.0), middle(100, 0.0)[1]) == ((11_250, 7_500), (0, 100), 0)
 
 
 # --- rolling out ------------------------------------------------------------------------------------------------

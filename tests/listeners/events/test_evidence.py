@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import FRAME_S, ListenerEvent
-from sfms_robot.lab.evaluation.whole_recordings import Scene, done_at, heard_in
+from sfms_robot.lab.evaluation.whole_recordings import Scene, done_at, heard_in, one_voice
 from sfms_robot.listeners.events.evidence import (
     AT,
     DONE,
@@ -112,10 +112,17 @@ def test_unknown_looks_are_no_evidence():
     one = scene(3)
     blind = Scene(one.speaks, np.full_like(one.looks, np.nan), one.laughs, one.nods, one.smiles)
     rows = heard_in(blind)
-    for name in ("gaze_known", "looked_at"):
-        assert not rows[:, AT[name]].any()
-    for name in ("looked_at_s", "looked_at_silence_s"):
-        assert np.isnan(rows[:, AT[name]]).all()
+    assert not rows[:, [AT["gaze_known"], AT["looked_at"]]].any()
+    assert np.isnan(rows[:, [AT["looked_at_s"], AT["looked_at_silence_s"]]]).all()
+
+
+def test_one_voice_has_the_phrases_of_all_and_the_look_of_the_one_who_speaks():
+    one = scene(3)
+    several, merged = heard_in(one), heard_in(one_voice(one))
+    phases, speaks = [AT[name] for name in ("phrase_s", "silence_s", "last_phrase_s")], one.speaks[:, 1:].any(axis=1)
+    np.testing.assert_array_equal(several[:, phases], merged[:, phases])
+    np.testing.assert_array_equal(several[speaks, AT["looked_at"]], merged[speaks, AT["looked_at"]])
+    assert several[:, AT["several_speak"]].any() and not merged[:, AT["several_speak"]].any()
 
 
 # --- what was done ----------------------------------------------------------------------------------------------

@@ -38,6 +38,7 @@ from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
+from sfms_robot.lab.corpora.compose.motions import pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
@@ -260,14 +261,14 @@ def cast(voices: Sequence[VoiceClip], rng: np.random.Generator) -> VoiceClip:
     """Draw a voice, often one whose mouth was filmed."""
     filmed = rng.random() < _FILMED
     fitting = [voice for voice in voices if (voice.mouth is not None) == filmed] or voices
-    return fitting[int(rng.integers(len(fitting)))]
+    return pick(fitting, rng)
 
 
 def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: np.random.Generator) -> VoiceClip | None:
     """Draw a filmed voice for the listener, if possible not the speaker's; None: none was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     fitting = [voice for voice in filmed if voice.name != other.name] or filmed
-    return fitting[int(rng.integers(len(fitting)))] if fitting else None
+    return pick(fitting, rng) if fitting else None
 
 
 # --- which stretches --------------------------------------------------------------------------------------------
@@ -404,7 +405,7 @@ def speaker_of(
     person, frames = stretch.person, stretch.frames
     said = np.clip(person.others - stretch.start_s, 0, frames * FRAME_S)
     speech, mouth = lay(said[said[:, 1] > said[:, 0]], frames, voice, rng)
-    laughs, nods = within(person.others_laughs, stretch), within(_spans(person.others_nods), stretch)
+    laughs, nods = within(person.others_laughs, stretch), within(spans_by(person.others_nods), stretch)
     audio = heard(laugh(speech, laughs, laughter, rng), voice, rng)
     if rng.random() < _FACELESS:
         return audio, np.full((frames, MOTION_DIM), np.nan, np.float32)
@@ -425,14 +426,14 @@ def attention_of(stretch: Stretch) -> Floats:
         holder[max(0, int(round((start - stretch.start_s) * FRAME_HZ))) :] = agent
     out = np.full(stretch.frames, np.nan, np.float32)
     for agent in person.gaze_known:
-        looks = active(_spans(person.looked_at, agent), stretch)
+        looks = active(spans_by(person.looked_at, agent), stretch)
         out[holder == agent] = looks[holder == agent]
     return out
 
 
-def _spans(told: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
-    """Return spans (K, 2) of what one agent did, or all."""
-    return np.array([(a, b) for a, b, who in told if agent in (None, who)], np.float64).reshape(-1, 2)
+def spans_by(events_s: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
+    """Return the spans (K, 2) of events (start, end, agent) of one agent, or of all."""
+    return np.array([(a, b) for a, b, who in events_s if agent in (None, who)], np.float64).reshape(-1, 2)
 
 
 def _looks(stretch: Stretch, dwell: Dwell, rng: np.random.Generator) -> tuple[tuple[float, float, str], ...]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from scipy import signal
@@ -13,6 +13,7 @@ from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_S, SMILE_CORNERS, Flo
 SHAPE: Final = {name: index for index, name in enumerate(BLENDSHAPES)}
 
 FADE: Final = FRAME_HZ
+_Item = TypeVar("_Item")
 SMILE: Final = [SHAPE[name] for name in SMILE_CORNERS]
 
 
@@ -88,7 +89,7 @@ def laid_event(kind: str, start_s: float, curve: Floats, size: float) -> Listene
     return ListenerEvent(kind, first_frame(start_s) * FRAME_S, len(curve) * FRAME_S, float(size))
 
 
-def pick(pieces: Sequence[Floats], rng: np.random.Generator) -> Floats:
+def pick(pieces: Sequence[_Item], rng: np.random.Generator) -> _Item:
     return pieces[int(rng.integers(len(pieces)))]
 
 

@@ -16,6 +16,7 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floa
 from sfms_robot.lab.corpora import conversational_states as labels
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
+from sfms_robot.lab.corpora.compose.motions import pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, room
 from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
@@ -115,11 +116,11 @@ class Dwell:
         found: list[Look] = []
         if not self.at_s or not self.away:
             return ()
-        at = float(rng.uniform(0, 1)) * self.at_s[int(rng.integers(len(self.at_s)))]
+        at = float(rng.uniform(0, 1)) * pick(self.at_s, rng)
         while at < length_s:
-            lasts_s, where = self.away[int(rng.integers(len(self.away)))]
+            lasts_s, where = pick(self.away, rng)
             found.append((at, min(at + lasts_s, length_s), where))
-            at += lasts_s + self.at_s[int(rng.integers(len(self.at_s)))]
+            at += lasts_s + pick(self.at_s, rng)
         return tuple(found)
 
 

@@ -19,7 +19,7 @@ from scipy.signal import oaconvolve
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Floats
 from sfms_robot.lab.corpora.clips import SPLITS, Split, by_split, split_of_voice
-from sfms_robot.lab.corpora.compose.motions import SHAPE
+from sfms_robot.lab.corpora.compose.motions import SHAPE, pick
 from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
@@ -105,7 +105,7 @@ def laugh(speech: Floats, spans_s: NDArray[np.float64], laughter: Sequence[Float
     for start_s, end_s in spans_s if laughter else ():
         at, end = (int(np.clip(t * AUDIO_HZ, 0, len(out))) for t in (start_s, end_s))
         while end - at > _FADE:
-            piece = laughter[int(rng.integers(len(laughter)))][: end - at]
+            piece = pick(laughter, rng)[: end - at]
             out[at : at + len(piece)] += np.float32(rng.uniform(0.5, 1.2)) * _eased(piece)
             at += len(piece)
     return out
@@ -298,7 +298,7 @@ def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: np.rand
 
     It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.
     """
-    source = talk[int(rng.integers(len(talk)))]
+    source = pick(talk, rng)
     piece = np.roll(source, int(rng.integers(len(source))), axis=0)[np.arange(frames) % len(source)]
     power = uniform_filter1d(speech[: frames * FRAME_SAMPLES].astype(np.float64) ** 2, 3 * FRAME_SAMPLES)
     level_db = 10 * np.log10(power[FRAME_SAMPLES - 1 :: FRAME_SAMPLES] + 1e-10)

@@ -22,7 +22,7 @@ import numpy as np
 from sfms_robot.frames import POSE, SHAPES, Floats, reorder
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, attempt
-from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, npz, npz_shapes, track, voices_of
+from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, npz, npz_shapes, present, track, voices_of
 
 FPS: Final = 25.0
 LICENCE: Final = "Apache 2.0, as its README says; made from RealTalk"
@@ -114,8 +114,7 @@ def _found(split: str, voices: Path, folder: Path, kind: Faces) -> Iterator[Foun
     def clip(listener: str) -> Clip:
         stems = [f"{listener[:-1]}{'21'[int(listener[-1]) - 1]}", listener]
         faces = [folder / f"{stem}{kind.ending}" for stem in stems]
-        if not faces[1].is_file():
-            raise ClipError.of("missing half", faces[1], "no such file")
+        present("missing half", faces[1])
         frames = frames_of(listener, *(kind.shape(file) for file in faces if file.is_file()))
         sounds = voices_of(*(voices / f"{stem}.wav" for stem in stems)) if voiced else []
         return Clip(name=listener, frames=frames, read=partial(_read, listener, faces, sounds, frames, kind))

@@ -27,7 +27,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Order, attempt
-from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, pose_last, table, track, voices_of
+from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, pose_last, present, table, track, voices_of
 
 SPACE: Final = "faceverse58"
 FPS, FPS_2025 = 25.0, 30.0
@@ -130,8 +130,7 @@ def attributes(folder: Path, clip: str, frames: int) -> Floats:
 
 def _feature(file: Path, frames: int, width: int) -> Floats:
     """Return (frames, width); the last row again where a feature ends a frame or two early. Raises ClipError."""
-    if not file.is_file():
-        raise ClipError.of("missing feature", file, "no such file")
+    present("missing feature", file)
     values = npy(file)
     had = min(frames, frames_of(str(file), values.shape, (frames, width)))
     return np.pad(track(str(file), values, had, width), ((0, frames - had), (0, 0)), mode="edge")

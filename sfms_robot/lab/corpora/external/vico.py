@@ -29,6 +29,7 @@ from sfms_robot.lab.corpora.reading import (
     npy,
     numbers,
     pose_last,
+    present,
     table,
     torch_load,
     track,
@@ -47,8 +48,7 @@ def _splits(listed: Callable[[Path], Mapping[str, str]], place: Path) -> Mapping
 
 def _rows(file: Path, load: Callable[[Path], Any], key: str) -> NDArray[Any]:
     """Return one array of a pickled dict. Raises ClipError."""
-    if not file.is_file():
-        raise ClipError.of("missing half", file, "no such file")
+    present("missing half", file)
     arrays = guarded(str(file), lambda: load(file))
     if not isinstance(arrays, dict) or key not in arrays:
         raise ClipError.of("missing half", file, f"has no {key}")
@@ -151,8 +151,7 @@ def vico_scan(place: Path, split: str, order: Order | None) -> Iterator[Found]:
 
 
 def _mfcc45(file: Path, frames: int) -> Floats:
-    if not file.is_file():
-        raise ClipError.of("missing feature", file, "no such file")
+    present("missing feature", file)
     return track(str(file), np.asarray(npy(file)), frames, 45)
 
 

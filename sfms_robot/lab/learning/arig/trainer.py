@@ -28,7 +28,7 @@ from sfms_robot.lab.learning.arig.features import (
     gather,
     open_scenes,
 )
-from sfms_robot.lab.learning.corpus import packed
+from sfms_robot.lab.learning.corpus import ACTIVE, packed
 from sfms_robot.lab.learning.job import Job, Run, is_drawn, noise_of
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
@@ -38,7 +38,6 @@ from sfms_robot.listeners.audio_frontend import MEL_WIDTH, track
 from sfms_robot.listeners.layers import weighted_mean
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel
-from sfms_robot.signals.control import COLUMNS
 
 HELD_OUT_WINDOWS, HELD_OUT_BATCH = 24, 4
 
@@ -139,9 +138,8 @@ def starts_by_event(corpus: ArigCorpus, starts: Mapping[str, Tensor], window: in
     control, found = corpus.frames.control, {}
     if control is None or not control.shape[-1]:
         return {}
-    active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
-    before = torch.zeros(len(control) + 1, len(active), dtype=torch.int32)  # frames with one, before each frame
-    before[1:] = (control[:, active] > 0).cumsum(0)
+    before = torch.zeros(len(control) + 1, len(ACTIVE), dtype=torch.int32)  # frames with one, before each frame
+    before[1:] = (control[:, ACTIVE] > 0).cumsum(0)
     for scene, firsts in starts.items():
         has = before[firsts + window] > before[firsts]
         found[scene] = [firsts[one] for one in has.unbind(1) if one.any()]

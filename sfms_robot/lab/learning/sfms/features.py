@@ -221,10 +221,15 @@ def _stretches(frames: int, size: int, least: int) -> list[int]:
     return sizes
 
 
+def standardised(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
+    """Return the motion (N, C) of the corpus, standardised, on the model's device."""
+    return model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+
+
 @torch.no_grad()
 def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Return the tokens (N, G) of every listener in the corpus."""
-    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    motion = standardised(model, corpus)
     mask = place_all(model.tokenizer, motion, corpus.lengths)
     return torch.where(mask > 0.5, keyframe_tokens(model, motion), 0)
 

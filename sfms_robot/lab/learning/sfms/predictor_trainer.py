@@ -16,7 +16,7 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.learning.corpus import fit_sound, packed, windows
+from sfms_robot.lab.learning.corpus import ACTIVE, fit_sound, packed, windows
 from sfms_robot.lab.learning.job import Job, Run, is_drawn, noise_of
 from sfms_robot.lab.learning.sfms.features import (
     SfmsCorpus,
@@ -25,11 +25,13 @@ from sfms_robot.lab.learning.sfms.features import (
     gather,
     held_tokens,
     keyframe_tokens,
+    standardised,
     tokenise,
     window_tokens,
     without_last_keyframes,
 )
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import WEIGHTS as TOKENIZER_WEIGHTS
+from sfms_robot.lab.learning.sfms.tokenizer_trainer import uniform
 from sfms_robot.lab.learning.training_loop import digest_of, fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.audio_frontend import AudioFrontend
@@ -37,7 +39,6 @@ from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 from sfms_robot.listeners.sfms.model import SfmsModel, neutral_tokens
 from sfms_robot.listeners.sfms.quantizer import codes_to_indices, indices_to_codes
 from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.mel import LN_PER_DB
 
 TokensOf = Literal["dyads", "windows"]
@@ -104,7 +105,7 @@ def listener_job(
     corpus, held_out = corpus.to(device), held_out.to(device)
     tokens, held_out_tokens = tokenise(model, corpus), tokenise(model, held_out)
     tokens_at, held = placed_tokens(model, corpus, tokens, listener, phase.tokens)
-    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    motion = standardised(model, corpus)
     dense = keyframe_tokens(model, motion) if phase.missed_keyframes else tokens
     levels = model.tokenizer.quantizer.levels if listener.quantizer == "fsq" else None
     costs = torch.tensor(model.tokenizer.costs, device=device)
@@ -171,15 +172,14 @@ def placed_tokens(
     if placed == "dyads":
         held = held_tokens(tokens, corpus.lengths) if listener.placement == "penalised" else None
         return lambda starts: windows(tokens, starts, listener.window_frames), held
-    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    motion = standardised(model, corpus)
     dense = keyframe_tokens(model, motion)
     return lambda starts: window_tokens(model, motion, dense, starts), None
 
 
 def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms) -> Tensor:
     """Return those of the `starts` in whose future an event other than a blink is under way."""
-    active = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
-    busy = (corpus.frames.control[:, active] > 0).any(-1)
+    busy = (corpus.frames.control[:, ACTIVE] > 0).any(-1)
     return starts[windows(busy, starts + listener.past_frames, listener.future_frames).any(1)]
 
 
@@ -237,14 +237,11 @@ def augment(
     b, p = seen.heard.shape
     device = seen.tokens.device
 
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(shape, generator=generator, device=generator.device).to(device)
-
-    heard = seen.heard & (uniform(b, 1) >= training.drop_audio)
-    known = seen.face_known & (uniform(b, 1) >= training.drop_face)
+    heard = seen.heard & (uniform((b, 1), generator, device) >= training.drop_audio)
+    known = seen.face_known & (uniform((b, 1), generator, device) >= training.drop_face)
     past = perturb(seen.tokens[:, :p], levels, training.history_noise, generator)
     # Neutral prefix (IV-C): the first frames are as a stream begins, with nothing heard or seen.
-    cold = uniform(b, 1) < training.neutral_prefix
+    cold = uniform((b, 1), generator, device) < training.neutral_prefix
     cut = torch.randint(1, p + 1, (b, 1), generator=generator, device=generator.device).to(device)
     frame = torch.arange(p, device=device)
     before = cold & (frame < cut)
@@ -264,7 +261,7 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torc
     if not is_drawn(generator, share):
         return tokens
     place = generator.device
-    changed = (tokens > 0) & (torch.rand(tokens.shape, generator=generator, device=place).to(tokens.device) < share)
+    changed = (tokens > 0) & (uniform(tokens.shape, generator, tokens.device) < share)
     if levels is None:
         return torch.where(changed, 0, tokens)
     codes = indices_to_codes((tokens - 1).clamp(min=0), levels)

@@ -20,7 +20,7 @@ from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.learning.corpus import first_frames, packed, windows
 from sfms_robot.lab.learning.job import Job, LossOf, Run, noise_of
-from sfms_robot.lab.learning.sfms.features import SfmsCorpus, SfmsFrames, fit_scales, gather, place_all
+from sfms_robot.lab.learning.sfms.features import SfmsCorpus, SfmsFrames, fit_scales, gather, place_all, standardised
 from sfms_robot.lab.learning.training_loop import fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
@@ -95,7 +95,7 @@ def tokenizer_job(
     fingerprint = corpus.fingerprint()
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
-    motion = model.standardise(corpus.frames.motion.to(model.motion_mean.device))
+    motion = standardised(model, corpus)
     return Job(
         name="tokenizer",
         model=model,
@@ -249,7 +249,7 @@ def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
     """Return consecutive windows (W, T, C), standardised."""
     window = model.tokenizer.window
     return windows(
-        model.standardise(corpus.frames.motion.to(model.motion_mean.device)),
+        standardised(model, corpus),
         first_frames(corpus.lengths, window, window),
         window,
     )
@@ -348,8 +348,8 @@ def states(
         chosen.append(mask[here])
         remaining.append(to_come[here])
         logits = score(track, mask, to_come.clamp(min=1))
-        noise = -torch.log(-torch.log(_uniform((n, t), generator, mask.device).clamp(1e-7, 1 - 1e-7)))
-        drawn = _uniform(n, generator, mask.device) < EXPLORED
+        noise = -torch.log(-torch.log(uniform((n, t), generator, mask.device).clamp(1e-7, 1 - 1e-7)))
+        drawn = uniform(n, generator, mask.device) < EXPLORED
         picked = (logits + noise * drawn[:, None]).argmax(1, keepdim=True)
         mask = mask.scatter(1, picked, 1.0)
     return torch.cat(rows), torch.cat(chosen), torch.cat(remaining)
@@ -366,7 +366,8 @@ def regrets(track: Tracks, chosen: Tensor, k: Tensor, most: int) -> Tensor:
     return ((errors - least) / (least + FLOOR)).masked_fill(chosen > 0.5, torch.inf)
 
 
-def _uniform(shape: int | tuple[int, int], generator: torch.Generator, device: torch.device) -> Tensor:
+def uniform(shape: int | tuple[int, ...], generator: torch.Generator, device: torch.device) -> Tensor:
+    """Draw numbers from 0 to 1 on the device of the generator; return them on another."""
     return torch.rand(shape, generator=generator, device=generator.device).to(device)
 
 
