@@ -49,6 +49,12 @@ def rounded(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
 
 
+def mean_interval(values: Doubles) -> list[float | None]:
+    """Return the interval of the mean of values (K,), for other values of the same kind."""
+    drawn = values[np.random.default_rng(0).integers(len(values), size=(DRAWS, len(values)))]
+    return [rounded(end) for end in ends(drawn.mean(axis=1)).tolist()]
+
+
 def finite(row: Mapping[str, Any]) -> dict[str, Any]:
     """Return a row for JSON: None in place of numbers that are not finite."""
     return {key: None if isinstance(value, float) and not np.isfinite(value) else value for key, value in row.items()}

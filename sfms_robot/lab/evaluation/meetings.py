@@ -34,18 +34,15 @@ from sfms_robot.lab.evaluation.listener_meetings import (
 from sfms_robot.lab.evaluation.robustness import motions_of, voice_folders
 from sfms_robot.lab.evaluation.rollout import load_at_hop, rollout, run_in_processes, spread
 from sfms_robot.lab.evaluation.whole_recordings import (
+    Scene,
     decisions,
     hazards_in,
     heard_in,
+    one_voice,
     scene_in,
     unspoken,
 )
 from sfms_robot.lab.learning.events.event_trainer import (
-    FLOOR,
-    GAZE,
-    OTHERS,
-    OWN_NODS,
-    PHASE,
     STUDY,
     Logistic,
     inputs,
@@ -67,7 +64,7 @@ from sfms_robot.ports import Listener
 from sfms_robot.signals import phase
 from sfms_robot.signals.motion_primitives import Motions
 
-_PREFIXES: Final = {"annotated": "annotated_", "decided": "decided_", "people": "people_", "R2": "r2_"}
+_PREFIXES: Final = {who: f"{who.lower()}_" for who in ("annotated", "one_voice", "decided", "people", "R2")}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,6 +197,7 @@ def _play(
         model, calmness = listener.when, listener.calmness
     if isinstance(model, EventModel):
         sums |= _by_events(model, calmness, person, one, seeds, options.own_voice)
+    sums |= timing.differences(sums)
     sightings: Mapping[str, Sightings] = {}
     if frames and not isinstance(listener, EventModel):
         speaker = part(one.speaker, first, frames)
@@ -229,7 +227,8 @@ def _by_events(
 ) -> Sums:
     """Return how the hazards, given the person's history, rank the person's events; and the listener's decisions.
 
-    The hazards are also computed from the annotations, without the losses of sensing.
+    The hazards are also computed from the annotations, without the losses of sensing; and from those with all others
+    as one person, which is the loss of a single microphone.
     """
 
     def hazards(heard: Doubles) -> dict[str, Doubles]:
@@ -239,7 +238,9 @@ def _by_events(
     speaking, silent = delayed(hazards(with_voice)), hazards(heard)
     other = hazards(sensed(shifted(one.speaker), calmness)[1])
     sums = timing.hazard_sums("", one, speaking["nod"], silent["nod"], other["nod"])
-    sums |= timing.hazard_sums("annotated_", one, *(hazards(each)["nod"] for each in annotated(person, one.frames)))
+    scene, _ = meeting_scene(person)
+    for who, seen in (("annotated_", scene), ("one_voice_", one_voice(scene))):
+        sums |= timing.hazard_sums(who, one, *(hazards(each)["nod"] for each in annotated(seen, one.frames)))
     for kind in timing.ANNOTATED:
         sums[f"{kind}_hazard_auc"] = timing.ranked(speaking[kind], one, kind)
     streams = decisions(model, with_voice if own_voice else heard, seeds, calmness)
@@ -306,13 +307,7 @@ def _rows(name: str, found: Mapping[str, Estimate]) -> list[dict[str, Any]]:
 # instant of another person's meeting. It gets exactly what the annotators saw, where a head has a microphone and a
 # camera; once with the person's own speech, and once fitted and evaluated without.
 
-_SILENT: Final = {
-    **PHASE,
-    **{name: knots for name, knots in FLOOR.items() if name != "floor_mine"},
-    **OWN_NODS,
-    **GAZE,
-    **OTHERS,
-}
+_SILENT: Final = {name: knots for name, knots in STUDY.items() if name not in ("floor_mine", "own_voice_s")}
 
 
 def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness) -> tuple[Doubles, Doubles]:
@@ -321,12 +316,11 @@ def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness) -> tuple[Doubles
     return heard_in(scene), heard_in(unspoken(scene))
 
 
-def annotated(person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Doubles]:
+def annotated(scene: Scene, frames: int) -> tuple[Doubles, Doubles, Doubles]:
     """Return the evidence (frames, len(HEARD)) that annotators saw in place of a microphone and a camera.
 
     With the listener's own voice, without it, and without it while the others are a minute off.
     """
-    scene, _ = meeting_scene(person)
     own, alone = heard_in(scene), heard_in(unspoken(scene))
     at = np.minimum(np.arange(frames), len(own) - 1)
     return own[at], alone[at], np.roll(alone, round(SHIFT_S * FRAME_HZ), axis=0)[at]

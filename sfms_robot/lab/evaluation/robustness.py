@@ -45,7 +45,7 @@ from sfms_robot.lab.corpora.clips import Split, split_of_voice
 from sfms_robot.lab.corpora.compose.render_events import lay_smile, speaker_motion
 from sfms_robot.lab.corpora.compose.voices import find_voices, mouth_over
 from sfms_robot.lab.evaluation.detection import seen
-from sfms_robot.lab.evaluation.intervals import DRAWS, ends, rounded
+from sfms_robot.lab.evaluation.intervals import mean_interval, rounded
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.lab.evaluation.rollout import Rollout, rollout, run_in_processes, speaker_frames
 from sfms_robot.lab.evaluation.whole_recordings import decisions, event_spans, heard_in, scene_in
@@ -357,14 +357,14 @@ def returned_smiles(
             rates_a_minute.append(len(begun_s) / length_s * 60)
             false.append(_share_followed(seen_s, begun_s) * len(seen_s) / length_s * 60)
     shares = np.array(answered)
-    drawn = shares[np.random.default_rng(0).integers(len(shares), size=(DRAWS, len(shares)))].mean(axis=1)
+    difference = shares[:, 0] - shares[:, 1]
     return {
         "speakers": [speaker.name for speaker in people],
         "minutes": length_s / 60,
         "answered": rounded(shares[:, 0].mean()),
         "shifted": rounded(shares[:, 1].mean()),
-        "difference": rounded((shares[:, 0] - shares[:, 1]).mean()),
-        "interval": [rounded(end) for end in ends(drawn[:, 0] - drawn[:, 1]).tolist()],
+        "difference": rounded(difference.mean()),
+        "interval": mean_interval(difference),
         "never_smiles_per_minute": rounded(float(np.mean(rates_a_minute))),
         "false_per_minute": rounded(float(np.mean(false))),
     }

@@ -218,6 +218,18 @@ def hazard_sums(who: str, one: ListenerMeeting, speaking: Doubles, silent: Doubl
     }
 
 
+def differences(sums: Sums) -> Sums:
+    """Return how much better each source ranks the same nods than the one it is compared with: the hazards given what
+    annotators saw against the reference, and with less to go by against that.
+    """
+    return {
+        f"{who}{name}_minus_{other}": sums[who + name] - sums[f"{other}_{name}"] * [1, 0]
+        for who, other in (("annotated_", "r2"), ("one_voice_", "annotated"), ("", "annotated"))
+        for name in ("nod_hazard_auc", "nod_hazard_auc_without_own_speech")
+        if {who + name, f"{other}_{name}"} <= sums.keys()
+    }
+
+
 def nod_contingency(who: str, runs: Runs, one: ListenerMeeting, within: Bools) -> Sums:
     """Return `contingent` for the nods of a listener with its own history.
 

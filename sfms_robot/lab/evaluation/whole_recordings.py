@@ -160,6 +160,21 @@ def unspoken(scene: Scene) -> Scene:
     return replace(scene, speaks=speaks)
 
 
+def one_voice(scene: Scene) -> Scene:
+    """Return the scene as one microphone and one camera have it.
+
+    All others are one person, whose look is that of the one who counts, and who nods only while silent.
+    """
+    others: Bools = scene.speaks[:, 1:].any(axis=1)
+    looks = np.fmax.reduce(np.where(counts_in(scene), scene.looks, np.nan), axis=1)
+    return replace(
+        scene,
+        speaks=np.stack([scene.speaks[:, MINE], others], axis=1),
+        looks=np.stack([looks, looks], axis=1),
+        nods=scene.nods & (phase.times(others)[:, 0] == 0),
+    )
+
+
 def _since(happens: Bools) -> Doubles:
     """Return (N,) seconds since the newest True."""
     index = np.arange(len(happens))

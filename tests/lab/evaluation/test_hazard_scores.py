@@ -11,9 +11,9 @@ from sfms_robot.lab.evaluation import timing
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, ListenerMeeting, shifted
 from sfms_robot.lab.evaluation.meetings import annotated, delayed, sensed
 from sfms_robot.lab.evaluation.rollout import speaker_frames
-from sfms_robot.lab.evaluation.whole_recordings import decisions, event_spans, hazards_in
-from sfms_robot.lab.learning.events.event_trainer import muted, student
-from sfms_robot.listeners.events.evidence import HEARD, Sensed
+from sfms_robot.lab.evaluation.whole_recordings import Scene, decisions, event_spans, hazards_in, heard_in, unspoken
+from sfms_robot.lab.learning.events.event_trainer import meeting_scene, muted, student
+from sfms_robot.listeners.events.evidence import AT, HEARD, Sensed
 from sfms_robot.listeners.events.model import STEP_FRAMES, EventModel, EventTables
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.events import runs
@@ -56,16 +56,9 @@ def meeting(talk, nods_s):
     silent = np.zeros(FRAMES, bool)
     spans = np.stack([nods_s, nods_s + 0.5], axis=1)
     return ListenerMeeting(
-        participant="A",
-        speaker=(),
-        spans_s={"nod": spans},
-        aside=np.zeros(0, bool),
-        others=talk,
-        own=silent,
-        unseen=silent,
-        alone=talk,
-        attention=np.full(FRAMES, np.nan),
-    )
+        participant="A", speaker=(), spans_s={"nod": spans}, aside=np.zeros(0, bool), others=talk, own=silent,
+        unseen=silent, alone=talk, attention=np.full(FRAMES, np.nan),
+    )  # fmt: skip
 
 
 def contingency(decides, speaker, one):
@@ -126,6 +119,35 @@ def test_delayed_hazards_know_a_frame_less():
     assert delayed({"nod": np.array([1.0, 2.0, 3.0])})["nod"].tolist() == [1.0, 1.0, 2.0]
 
 
+# Deciles of the lengths [s] of phrases and of pauses in meetings: of oneself, and of the others.
+TURNS_S = (
+    ((0.03, 0.3, 0.4, 0.6, 1, 1.5, 2.4, 3.9, 6.4, 11.7, 30), (0.2, 1.1, 1.5, 2, 2.8, 4.1, 6, 9.2, 15.7, 31.9, 120)),
+    ((0.03, 0.3, 0.6, 1.1, 1.9, 2.9, 4.6, 6.8, 10.5, 17.8, 40), (0.2, 0.4, 0.7, 1, 1.2, 1.5, 1.9, 2.6, 4.1, 7.7, 30)),
+)
+
+
+def turns(deciles_s, frames, rng):
+    """(frames,) pauses and phrases of these lengths, one after the other."""
+    phrases, pauses = ([np.interp(rng.random(2000), np.linspace(0, 1, 11), each)] for each in deciles_s)
+    lengths = np.concatenate([*pauses, *phrases]).reshape(2, -1).T.ravel() * FRAME_HZ
+    return np.repeat(np.tile([False, True], 2000), np.round(lengths).astype(int))[:frames]
+
+
+@pytest.mark.parametrize("speaks", [True, False])
+def test_a_rate_is_true_of_a_head_that_speaks_and_of_one_that_never_does(speaks):
+    rng, frames = np.random.default_rng(1), 60 * 60 * FRAME_HZ
+    asked = {"nod": 2.0, "smile": 1.2, "brow_raise": 1.0}
+    voices = np.stack([turns(each, frames, rng) for each in TURNS_S], axis=1)
+    laughs, smiles = (np.repeat(rng.random(frames // 50) < share, 50) for share in (0.02, 0.01))
+    scene = Scene(voices, np.full(voices.shape, np.nan), laughs, np.zeros(frames, bool), 0.6 * (laughs | smiles))
+    heard = heard_in(scene if speaks else unspoken(scene))
+    decided = decisions(EventModel.load(), heard, range(4), Calmness(**asked, blink=0, gaze_shift=0))
+    listening = (heard[:, AT["silence_s"]] <= 2.0) & (heard[:, AT["own_voice_s"]] > 0)
+    for kind, rate in asked.items():
+        count = sum(len(event_spans(events, kind)) for events in decided)
+        assert count / (4 * listening.sum() / FRAME_HZ / 60) == pytest.approx(rate, rel=0.15), kind
+
+
 @pytest.mark.slow
 def test_seeds_scatter_as_people_do_and_some_do_not_nod_in_the_demo_at_all():
     """Three hundred seeds hear the person of the demo for 48 s. Counts of people vary by 1.28 to 1.82 of their mean."""
@@ -146,7 +168,7 @@ def test_seeds_scatter_as_people_do_and_some_do_not_nod_in_the_demo_at_all():
 def test_what_annotators_saw_is_what_hazards_were_taught_on(tmp_path):
     person = read_people(write_tables(tmp_path, until_s=120.0))[0]
     frames = int(person.until_s * FRAME_HZ)
-    own, alone, elsewhere = annotated(person, frames)
+    own, alone, elsewhere = annotated(meeting_scene(person)[0], frames)
     one = student(person, np.random.default_rng(0))
     for given, told in ((one, own), (muted(one), alone)):
         taught = given.evidence[1:, : len(HEARD)]  # as steps begin

@@ -120,7 +120,7 @@ def test_timing_tells_people_decisions_motion_and_the_reference_apart_and_who_sp
         for name in ("nods_per_minute", "addressed_nods_per_minute", "bystander_nods_per_minute", "phrase_end_ratio"):
             assert prefix + name in found and prefix + name in found["interval"]
     auc = ("nod_hazard_auc", "nod_hazard_auc_without_own_speech", "shifted_nod_hazard_auc")
-    assert all(0 <= found[who + name] <= 1 for name in auc for who in ("", "annotated_", "r2_"))
+    assert all(0 <= found[who + name] <= 1 for name in auc for who in ("", "annotated_", "one_voice_", "r2_"))
     assert found["people_nods_per_minute"] == pytest.approx(5, abs=1.5)
     assert {"interval_ks", "table_nod_auc", "blinks_per_minute", "smiles_per_minute", "detector"} <= set(found)
     assert found["people_smiles_per_minute"] is None and found["notes"]

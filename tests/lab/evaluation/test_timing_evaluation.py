@@ -27,11 +27,7 @@ def spans(starts_s, length_s=0.6):
 def talk(seed=0):
     """(N,) talk in phrases of 1 to 8 s with pauses of 0.4 to 3 s."""
     rng = np.random.default_rng(seed)
-    pieces, total = [], 0
-    while total < FRAMES:
-        piece = np.r_[np.ones(rng.integers(25, 200), bool), np.zeros(rng.integers(10, 75), bool)]
-        pieces.append(piece)
-        total += len(piece)
+    pieces = [np.r_[np.ones(rng.integers(25, 200), bool), np.zeros(rng.integers(10, 75), bool)] for _ in range(1800)]
     return np.concatenate(pieces)[:FRAMES]
 
 
@@ -84,10 +80,8 @@ def test_people_judged_against_themselves_are_themselves():
 def test_nods_at_random_know_no_phrase_ends_and_rank_nothing():
     one = meeting(answering(talk()))
     runs = [spans(anywhere(4000, seed)) for seed in range(8)]
-    everything = np.ones(FRAMES, bool)
-    found = figures(
-        (one, timing.nod_sums("decided_", one, runs) | timing.nod_contingency("decided_", runs, one, everything))
-    )
+    contingency = timing.nod_contingency("decided_", runs, one, np.ones(FRAMES, bool))
+    found = figures((one, timing.nod_sums("decided_", one, runs) | contingency))
     assert found["decided_phrase_end_ratio"] == pytest.approx(1.0, abs=0.05)
     assert found["decided_nod_auc"] == pytest.approx(0.5, abs=0.05)
 
@@ -136,8 +130,7 @@ def test_what_a_finder_misses_is_made_up_for():
 
 # --- ranking ----------------------------------------------------------------------------------------------------
 def test_moving_a_listeners_own_nods_tells_the_same():
-    one = meeting(answering(talk()))
-    everything = np.ones(FRAMES, bool)
+    one, everything = meeting(answering(talk())), np.ones(FRAMES, bool)
     runs = [spans(answering(talk(), seed=seed)) for seed in range(1, 9)]
     found = timing.nod_contingency("", runs, one, everything)
     assert found["nod_auc"][0] / found["nod_auc"][1] > 0.8
@@ -149,11 +142,8 @@ def test_moving_a_listeners_own_nods_tells_the_same():
 def test_too_short_a_part_cannot_be_shifted_and_few_nods_or_none_annotated_are_not_ranked():
     one = meeting(answering(talk()))
     found = timing.nod_contingency("", [one.spans_s["nod"]], one, np.arange(FRAMES) < 90 * FRAME_HZ)
-    assert (
-        found["nod_auc"][1] > 0
-        and not found["shifted_nod_auc"].any()
-        and not found["nod_auc_matched_minus_shifted"].any()
-    )
+    assert found["nod_auc"][1] > 0
+    assert not any(found[name].any() for name in ("shifted_nod_auc", "nod_auc_matched_minus_shifted"))
     assert not timing.ranked(np.zeros(FRAMES), meeting([5.0, 9.0])).any()
     assert not timing.ranked(np.zeros(FRAMES), meeting(anywhere(99)), "gaze_shift").any()
 
@@ -161,9 +151,8 @@ def test_too_short_a_part_cannot_be_shifted_and_few_nods_or_none_annotated_are_n
 def test_an_instant_is_ranked_by_what_is_known_before_it():
     """A score that is high only once a nod has begun knows nothing of when it begins."""
     one = meeting(anywhere(200))
-    assert timing.ranked(one.inside("nod").astype(float), one)[0] / timing.ranked(np.zeros(FRAMES), one)[
-        1
-    ] == pytest.approx(0.5, abs=0.01)
+    score, nods = timing.ranked(one.inside("nod").astype(float), one)
+    assert score / nods == pytest.approx(0.5, abs=0.01)
     np.testing.assert_array_equal(meeting([10.0, 10.06]).instants("nod"), [249, 250])
 
 
@@ -212,9 +201,7 @@ def test_meetings_are_spread_evenly_and_played_from_their_middle():
     people = list(range(134))
     assert spread(people, 3) == [0, 66, 133]
     assert spread(people, None) == spread(people, 500) == people
-    assert middle(30_000, 5.0) == (11_250, 7_500)
-    assert middle(100, 5.0) == (0, 100)
-    assert middle(100, 0.0)[1] == 0
+    assert (middle(30_000, 5.0), middle(100, 5.0), middle(100, 0.0)[1]) == ((11_250, 7_500), (0, 100), 0)
 
 
 # --- rolling out ------------------------------------------------------------------------------------------------

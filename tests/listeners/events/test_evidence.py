@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.frames import FRAME_S, ListenerEvent
-from sfms_robot.lab.evaluation.whole_recordings import Scene, done_at, heard_in
+from sfms_robot.lab.evaluation.whole_recordings import Scene, done_at, heard_in, one_voice
 from sfms_robot.listeners.events import evidence
 
 FRAMES = 600
@@ -99,10 +99,17 @@ def test_unknown_looks_are_no_evidence():
     one = scene(3)
     blind = Scene(one.speaks, np.full_like(one.looks, np.nan), one.laughs, one.nods, one.smiles)
     rows = heard_in(blind)
-    for name in ("gaze_known", "looked_at"):
-        assert not rows[:, evidence.AT[name]].any()
-    for name in ("looked_at_s", "looked_at_silence_s"):
-        assert np.isnan(rows[:, evidence.AT[name]]).all()
+    assert not rows[:, [evidence.AT["gaze_known"], evidence.AT["looked_at"]]].any()
+    assert np.isnan(rows[:, [evidence.AT["looked_at_s"], evidence.AT["looked_at_silence_s"]]]).all()
+
+
+def test_one_voice_has_the_phrases_of_all_and_the_look_of_the_one_who_speaks():
+    one, at = scene(3), evidence.AT
+    several, merged = heard_in(one), heard_in(one_voice(one))
+    phases, speaks = [at[name] for name in ("phrase_s", "silence_s", "last_phrase_s")], one.speaks[:, 1:].any(axis=1)
+    np.testing.assert_array_equal(several[:, phases], merged[:, phases])
+    np.testing.assert_array_equal(several[speaks, at["looked_at"]], merged[speaks, at["looked_at"]])
+    assert several[:, at["several_speak"]].any() and not merged[:, at["several_speak"]].any()
 
 
 # --- what was done ----------------------------------------------------------------------------------------------

@@ -386,7 +386,7 @@ def speaker_of(
     """
     person, frames = stretch.person, stretch.frames
     speech, mouth = _laid(person.others, stretch, voice, rng)
-    laughs, nods = within(person.others_laughs, stretch), within(_spans(person.others_nods), stretch)
+    laughs, nods = within(person.others_laughs, stretch), within(spans_by(person.others_nods), stretch)
     audio = heard(laugh(speech, laughs, laughter, rng), voice, rng)
     if rng.random() < _FACELESS:
         return audio, np.full((frames, MOTION_DIM), np.nan, np.float32)
@@ -407,12 +407,12 @@ def attention_of(stretch: Stretch) -> Floats:
         holder[max(0, first_frame(start - stretch.start_s)) :] = agent
     out = np.full(stretch.frames, np.nan, np.float32)
     for agent in person.gaze_known:
-        looks = active(_spans(person.looked_at, agent), stretch)
+        looks = active(spans_by(person.looked_at, agent), stretch)
         out[holder == agent] = looks[holder == agent]
     return out
 
 
-def _spans(told: Sequence[LabelledSpan], agent: str | None = None) -> Doubles:
+def spans_by(told: Sequence[LabelledSpan], agent: str | None = None) -> Doubles:
     """Return spans (K, 2) of what one agent did, or all."""
     return np.array([(a, b) for a, b, who in told if agent in (None, who)], np.float64).reshape(-1, 2)
 

@@ -12,7 +12,7 @@ which they were possible, given the person's history (AUC, mean over people).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, Ints
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
-from sfms_robot.lab.corpora.compose.composed import Stretch, active
+from sfms_robot.lab.corpora.compose.composed import Stretch, active, spans_by
 from sfms_robot.lab.evaluation.intervals import Sums
 from sfms_robot.lab.evaluation.phrase_timing import (
     listening_mask,
@@ -322,11 +322,6 @@ def listening_in(person: MeetingPerson, stretch: Stretch) -> Bools:
     others, own, unseen = (active(spans, stretch) for spans in (person.others, person.talk, person.unseen))
     listening: Bools = listening_mask(others, FRAME_HZ, own) & ~unseen
     return listening
-
-
-def spans_by(events_s: Sequence[tuple[float, float, str]], agent: str | None = None) -> Doubles:
-    """Return the spans (K, 2) of events (start, end, agent) of one agent, or of all."""
-    return np.array([(a, b) for a, b, who in events_s if agent in (None, who)], np.float64).reshape(-1, 2)
 
 
 # --- fitting ----------------------------------------------------------------------------------------------------
