@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.config import load_head
 from sfms_robot.motion.jerk_step import StopChase, TimeOptimalChase
-from sfms_robot.motion.limits import JerkLimiter, JointLimits
+from sfms_robot.motion.limits import JerkLimiter, JointLimits, _one_tick
 from sfms_robot.runtime.loop import difference
 
 DT_S = 0.01
@@ -153,6 +153,17 @@ def test_a_step_leaves_its_state_alone():
     goals, after = LIMITER.step(standing(LIMITS.high), state)
     goals += 1.0
     assert not state.motion.any() and (after.motion[0] <= LIMITS.high).all()
+
+
+def test_two_states_tell_the_jerks_between_them_and_what_the_tick_reaches_inside():
+    jerks, before = np.array([700.0, -400.0, 250.0]), np.array([0.2, 0.5, -3.0])
+    state, corners, h = before, [], DT_S / 3
+    for jerk in jerks:
+        q, v, a = state
+        state = np.array([q + v * h + a * h**2 / 2 + jerk * h**3 / 6, v + a * h + jerk * h**2 / 2, a + jerk * h])
+        corners.append(state[2])
+    told = _one_tick(DT_S) @ np.concatenate([before, state])
+    assert told == pytest.approx([*jerks, *corners[:2], state[0] - before[0]], rel=1e-6)
 
 
 def test_the_reference_of_a_parabola_is_exact():

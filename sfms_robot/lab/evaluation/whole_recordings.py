@@ -165,7 +165,7 @@ def one_voice(scene: Scene) -> Scene:
 
     All others are one person, whose look is that of the one who counts, and who nods only while silent.
     """
-    others: Bools = scene.speaks[:, 1:].any(axis=1)
+    others = np.any(scene.speaks[:, 1:], axis=1)
     looks = np.fmax.reduce(np.where(counts_in(scene), scene.looks, np.nan), axis=1)
     return replace(
         scene,
