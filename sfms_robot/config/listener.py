@@ -33,8 +33,8 @@ class Calmness(Model):
     looked at nods more often, one that is not nods less often.
 
     Attributes:
-        nod, shake, tilt: of the head. Its own nods included, a head nods a tenth more often than the rate: 2.0 are
-            people's 2.2. Nods, shakes, smiles, laughs, brows and "mm-hm" only come while listening.
+        nod, shake, tilt: of the head. Its own nods included, a head in a meeting nods at this rate, within a tenth.
+            Nods, shakes, smiles, laughs, brows and "mm-hm" only come while listening.
         gaze_shift: looks away from the person; each is followed by a look back.
         addressed: sense: the person's attention decides whether the head is addressed, and without any face it is;
             assume: it always is; never: it never is.
