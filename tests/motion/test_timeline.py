@@ -91,6 +91,12 @@ def test_a_blink_of_one_frame_reaches_its_peak_at_a_tick_wherever_the_ticks_fall
     assert rows[:, BLINK].min() == 0.0
 
 
+def test_a_face_beyond_its_range_is_played_at_the_end_of_it():
+    state = TIMELINE.accept(plan(0.0, motions(8, mouthSmileLeft=1.5, jawOpen=-0.5, pitch=0.3)), TIMELINE.start())
+    smile, jaw, pitch = at(state, 0.2)[0, [SMILE, CHANNEL_INDEX["jawOpen"], PITCH]]
+    assert (smile, jaw) == (1.0, 0.0) and pitch == pytest.approx(0.3)
+
+
 def test_a_newer_plan_takes_over_within_two_frames():
     old, new = motions(8, pitch=0.0, mouthSmileLeft=0.0), motions(8, pitch=0.3, mouthSmileLeft=0.9)
     state = TIMELINE.accept(plan(0.0, old), TIMELINE.start())
