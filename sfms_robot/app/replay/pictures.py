@@ -268,7 +268,7 @@ def _signal(motion: Floats, name: str) -> Floats:
 
 
 def _nods(times_s: Doubles, motion: Floats) -> list[tuple[int, int, int]]:
-    """Return the rows at which nods begin, are lowest and end; a head that goes up and comes back looks up."""
+    """Return the rows at which nods begin, are lowest and end. Up and back is a look, not a nod."""
     if len(times_s) < 2:
         return []
     pitch, rate_hz = motion[:, CHANNEL_INDEX["pitch"]], 1.0 / float(np.median(np.diff(times_s)))
