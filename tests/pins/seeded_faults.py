@@ -100,7 +100,7 @@ FAULTS = (
         STARTUP, "if table.model_number is not None and found.model_number != table.model_number:", "if False:", WIRE
     ),
     Fault(STARTUP, "if limits is not None and not _inside(present, limits):", "if False:", WIRE),
-    Fault(STARTUP, "if len(answer.data) != length:", "if False:", WIRE),
+    Fault("servo/chain/protocol2.py", "len(params) == length or (error & 0x7F and not params)", "True", WIRE),
     Fault(STARTUP, "return limits[0] <= ticks <= limits[1]", "return limits[0] <= ticks", WIRE),
     # halt
     Fault("runtime/halt.py", 'if door in ("device", cause[1]) and', "if", LOOP),

@@ -196,6 +196,8 @@ def test_a_second_halt_while_joints_come_back_halts_again(chain, after):
     ]  # fmt: skip
     assert ran.ticks[250 + after + 1].why == ("page",)
     assert torques == [NECK]
+    halted = ran.ticks[250 + after + 2 : 250 + after + 60]
+    assert not any(each.rejoined for tick in halted for each in tick.readings.values())  # those on their way stay off
     assert set(came_back(ran)) == set(JOINTS) - set(NECK)
 
 
