@@ -58,6 +58,7 @@ def listened(listener, **options):
     return run(dataclasses.replace(RunOptions(listener=str(listener), fast=True, seed=3), **options))
 
 
+@pytest.mark.slow
 def test_a_voice_shorter_than_the_run_ends_and_the_head_goes_on(seeded, tmp_path):
     said = voice(tmp_path / "said.wav", 0.6)
     done = listened(seeded, agent_audio=said, duration_s=2.0)

@@ -167,6 +167,7 @@ def test_connections_that_stay_half_open_make_room(stream):
         each.close()
 
 
+@pytest.mark.slow
 def test_a_client_that_does_not_read_misses_frames_and_nothing_waits(stream):
     async def slow():
         from websockets.asyncio.client import connect as connect_async

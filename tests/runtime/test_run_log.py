@@ -72,6 +72,7 @@ class NoAudit:
         return None
 
 
+@pytest.mark.slow
 def test_a_log_of_hours_is_as_large_as_one_of_minutes():
     log = RunLog(joints=["a", "b"], period_s=1 / RATE_HZ, audit=NoAudit())
     log.start(np.zeros(2))

@@ -106,7 +106,7 @@ WRITTEN = {"tokenizer": tokenizer.WEIGHTS, "listener": checkpoint.WEIGHTS}
     ("phase", "placement", "stop"),
     [
         ("tokenizer", "exact", 17),
-        ("listener", "exact", 8),
+        pytest.param("listener", "exact", 8, marks=pytest.mark.slow),
         pytest.param("tokenizer", "learned", 9, marks=pytest.mark.slow),
         pytest.param("tokenizer", "static", 29, marks=pytest.mark.slow),
         pytest.param("listener", "exact", 1, marks=pytest.mark.slow),

@@ -256,6 +256,7 @@ def test_a_smile_is_returned_in_time_and_size_and_more_smiles_more_often():
     assert sum(map(len, few)) < 0.6 * len(begun_s)
 
 
+@pytest.mark.slow
 def test_a_silent_person_who_smiles_is_smiled_at_and_one_who_always_smiles_is_not_all_the_time():
     silence = sound(np.zeros(FRAMES, bool))
     face = smiling(np.arange(5.0, 115.0, 10.0))

@@ -175,7 +175,7 @@ def test_a_ramp_begins_no_earlier_than_what_it_was_told_for():
     ]
 
 
-@pytest.mark.parametrize("hop", [1, 2, 4])
+@pytest.mark.parametrize("hop", [pytest.param(1, marks=pytest.mark.slow), 2, 4])
 def test_nods_come_out_as_told_and_when(hop: int):
     """Of every length and size that are decided: the shipped listener, told of them in silence."""
     listener = at_hop(load_listener(find("listeners", "sfms-small", "config.yaml")), hop).how
