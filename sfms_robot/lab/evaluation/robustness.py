@@ -43,7 +43,7 @@ from sfms_robot.frames import (
 )
 from sfms_robot.lab.corpora.clips import Split, split_of_voice
 from sfms_robot.lab.corpora.compose.render_events import lay_smile, speaker_motion
-from sfms_robot.lab.corpora.compose.voices import find_voices, mouth_over
+from sfms_robot.lab.corpora.compose.voices import VOICE_FOLDERS, find_voices, mouth_over
 from sfms_robot.lab.evaluation.detection import seen
 from sfms_robot.lab.evaluation.intervals import mean_interval, rounded
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
@@ -64,7 +64,6 @@ RANGES: Final[Mapping[str, tuple[float, float]]] = {"nod": (3.0, 7.0), "blink": 
 _DISPERSION: Final = (0.7, 2.0)  # variance over mean of counts: 1 is Poisson's
 _NOISE_DB: Final = -10.0  # below speech
 _RT60_S: Final = 0.6
-_VOICE_FOLDERS: Final = ("facegood_audio_mouth", "speech_audio", "conversation_audio", "ami_audio_clips")
 
 
 def evaluate_robustness(
@@ -156,7 +155,7 @@ def voice_folders(data: Path | None) -> tuple[Path, ...]:
     """Return the folders of the bundled speakers and of the voices in a data folder."""
     if data is not None and not data.is_dir():
         raise ConfigError(f"--data {data}: no such folder")
-    brought = [] if data is None else [data / name for name in _VOICE_FOLDERS if (data / name).is_dir()]
+    brought = [] if data is None else [data / name for name in VOICE_FOLDERS if (data / name).is_dir()]
     return (data_dir("sim") / "speakers", *brought)
 
 

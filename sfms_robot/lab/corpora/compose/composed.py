@@ -41,6 +41,7 @@ from sfms_robot.lab.corpora.compose.motions import Rng, first_frame, pick
 from sfms_robot.lab.corpora.compose.render_events import NO_SPANS, Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
+    VOICE_FOLDERS,
     VoiceClip,
     find_laughter,
     find_voices,
@@ -62,7 +63,6 @@ Scene = Literal["listening", "interaction"]
 SetName = Scene | Literal["speaking"]
 # Minutes of the sets that speak, per minute of listening.
 SHARES: Final[Mapping[SetName, float]] = {"interaction": 0.5, "speaking": 0.25}
-_SOUNDS: Final = ("facegood_audio_mouth", "speech_audio", "conversation_audio", "ami_audio_clips")
 _FILMED: Final = 0.4  # share of dyads with a voice whose mouth was recorded
 _FACELESS: Final = 0.25  # share of those in which the speaker is heard only
 _FLOOR_S: Final = 1.0  # a shorter phrase does not take the floor
@@ -213,7 +213,7 @@ def _whole_part(data: Path, part: Part, seed: int) -> list[tuple[Part, Path, flo
 def material_of(data: Path) -> dict[Split, Material]:
     """Return the material in a folder, and the bundled, read once. Raises ConfigError."""
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
-    brought = [folder for folder in (*(data / name for name in _SOUNDS), ami) if folder.is_dir()]
+    brought = [folder for folder in (*(data / name for name in VOICE_FOLDERS), ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
     return read_material(ami, [*bundled, *brought], data_dir("sim") / "listeners" / "motions.npz")
 

@@ -26,6 +26,12 @@ from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.events import runs
 from sfms_robot.signals.tracks import read_track, resample
 
+VOICE_FOLDERS: Final = (
+    "facegood_audio_mouth",
+    "speech_audio",
+    "conversation_audio",
+    "ami_audio_clips",
+)  # of a data folder
 _SOUNDS: Final = (".wav", ".flac")
 # Two people in one track, hardly audible, hardly any speech, or people talking over one another.
 _UNFIT: Final = (
