@@ -1,5 +1,7 @@
 """Stream equals offline, later sound changes nothing before it, gain changes nothing at all."""
 
+from itertools import accumulate
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -75,16 +77,14 @@ def test_times_are_those_of_the_pattern(active):
         return
     joined = "".join("x" if on else "." for on in active)
     trailing = len(joined) - len(joined.rstrip("."))
-    phrases, gap = [], "." * GAP_FRAMES
-    for piece in joined.split(gap):
-        inside = piece.strip(".")
-        if inside:
-            phrases.append(inside)
+    phrases = [inside for piece in joined.split("." * GAP_FRAMES) if (inside := piece.strip("."))]
     ongoing = bool(phrases) and trailing < GAP_FRAMES
     expected_speech = len(phrases[-1]) + trailing if ongoing else 0
     done = phrases[:-1] if ongoing else phrases
     expected_last = len(done[-1]) if done else 0
     speech_s, silence_s, last_s = phase.times(active)[-1] / FRAME_S
+    stream = [*accumulate(active, SpeechPhase.after, initial=SpeechPhase())][1:]
+    np.testing.assert_allclose(phase.times(active), [one.times_s for one in stream], atol=1e-9)
     assert (round(speech_s), round(silence_s), round(last_s)) == (expected_speech, trailing, expected_last)
 
 

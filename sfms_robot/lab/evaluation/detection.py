@@ -112,8 +112,10 @@ def seen(motion: Floats, kind: str) -> list[tuple[float, float, float]]:
 
 
 def _pitch(motion: Floats) -> Doubles:
-    """Return the pitch (N,) of motion (N, 58) but for the head's part of looking, if the eyes move at all (untracked
-    eyes do not): the head goes along with a look aside and comes back, which is not a nod.
+    """Return the pitch (N,) of motion (N, 58) without the head's part of looking.
+
+    The head goes along with a look aside and comes back, which is not a nod. Eyes that do not move at all are not
+    tracked: then nothing is removed.
     """
     pitch = motion[:, CHANNEL_INDEX["pitch"]].astype(float)
     return pitch - head_part(gaze_rad(motion))[:, 1] if motion[:, _EYES].any() else pitch
@@ -297,7 +299,7 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
         "phrase_end_ratio": phrase_timing.ratio_of(counts.tolist()),
         "blinks": len(_lasted_s(motions, "eyeBlinkLeft", events.find_blinks)) / minutes,
         "smiles": len(_lasted_s(motions, "mouthSmileLeft", events.find_smiles)) / minutes,
-        "still_share": float(np.mean(still or np.nan)),
+        "still_share": float(np.mean(still)) if still else np.nan,
         "speed_deg_s": _fastest(motions, 1),
         "acceleration_deg_s2": _fastest(motions, 2),
         "jerk_deg_s3": _fastest(motions, 3),
@@ -344,7 +346,7 @@ def movement(motions: Sequence[Floats], addressed: Sequence[Bools]) -> dict[str,
         "nod_swings": middle(swings),
         "blink_s": middle(_lasted_s(motions, "eyeBlinkLeft", events.find_blinks)),
         "smile_s": middle(_lasted_s(motions, "mouthSmileLeft", events.find_smiles)),
-        "look_s": middle(sum(map(looks_s, gazes), [])),
+        "look_s": middle([length_s for gaze in gazes for length_s in looks_s(gaze)]),
         "gaze_on_person": float(on_person.mean()) if len(on_person) else np.nan,
         "gaze_shifts_per_minute": sum(map(shifts, gazes)) / minutes if minutes else np.nan,
         **{

@@ -219,8 +219,9 @@ def hazard_sums(who: str, one: ListenerMeeting, speaking: Doubles, silent: Doubl
 
 
 def differences(sums: Sums) -> Sums:
-    """Return how much better each source ranks the same nods than the one it is compared with: the hazards given what
-    annotators saw against the reference, and with less to go by against that.
+    """Return how much better each source of evidence ranks the same nods than the one it is compared with.
+
+    The hazards given what annotators saw are compared with the reference, and those with less to go by with these.
     """
     return {
         f"{who}{name}_minus_{other}": sums[who + name] - sums[f"{other}_{name}"] * [1, 0]
