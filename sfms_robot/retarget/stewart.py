@@ -33,7 +33,7 @@ from sfms_robot.signals import rotations
 
 TOLERANCE: Final = 1e-14  # of a pose that is searched for
 ARRIVED_M: Final = 1e-12  # error of the rods' lengths
-FOLLOW_STEPS: Final = 16
+FOLLOW_RAD: Final = 0.25  # the most that a crank turns between two poses of a search
 MIN_STIFFNESS: Final = 0.02  # share of the stiffness (determinant) at home
 DEAD_CENTRE: Final = 0.999  # a crank turns at most some 22 times as fast as in the middle of its stroke
 ROUNDING_RAD: Final = 1e-9  # so that a pose right at a limit is still within it, seen from a turned body
@@ -112,22 +112,21 @@ class Platform:
     def _pose(self, angles: Doubles, begin: Doubles) -> Doubles:
         """Return the pose (6,) of crank angles (6,).
 
-        Several poses fit the same cranks: where the search arrives at one with a loose direction in between, it follows
-        the cranks in small steps from `begin` instead.
+        Several poses fit the same cranks: the search follows the cranks from `begin` in small steps, and ends where it
+        passes a pose with a loose direction.
         """
         from scipy.optimize import root  # only pictures of a head need it
 
         before = self.inverse(begin)
-        for steps in (1, FOLLOW_STEPS) if np.isfinite([angles, before]).all() else ():
-            pose = begin
-            for share in np.arange(1, steps + 1) / steps:
-                tips = self._tips(before + share * (angles - before))
-                found = root(partial(self._excess_m, tips=tips), pose, tol=TOLERANCE)
-                pose = np.asarray(found.x)
-            same_side = self.stiffness(pose, angles) * self.stiffness(begin, before) > 0
-            if np.abs(found.fun).max() < ARRIVED_M and (same_side or steps > 1):
-                return pose
-        return np.full(6, np.nan)
+        if not np.isfinite([angles, before]).all():
+            return np.full(6, np.nan)
+        steps = max(int(np.ceil(np.abs(angles - before).max() / FOLLOW_RAD)), 1)
+        pose = begin
+        for cranks in before + np.arange(1, steps + 1)[:, None] / steps * (angles - before):
+            found = root(partial(self._excess_m, tips=self._tips(cranks)), pose, tol=TOLERANCE)
+            pose = np.asarray(found.x)
+        same_side = self.stiffness(pose, angles) * self.stiffness(begin, before) > 0
+        return pose if same_side and np.abs(found.fun).max() < ARRIVED_M else np.full(6, np.nan)
 
     def _excess_m(self, pose: Doubles, tips: Doubles) -> Doubles:
         """Return the excess length (6,) of each rod, to first order."""

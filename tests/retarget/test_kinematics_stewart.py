@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from published import rows
 
@@ -47,6 +47,7 @@ def test_the_inverse_is_that_of_the_published_geometry(row):
 
 
 @given(seeds)
+@example(249377242)  # a search in one step ends in another pose of the same cranks
 def test_forward_of_inverse_is_the_pose_and_every_rod_keeps_its_length(seed):
     wanted = in_reach(seed, 100)
     assert np.abs(PLATFORM.forward(PLATFORM.inverse(wanted), HOME) - wanted).max() < 1e-9
