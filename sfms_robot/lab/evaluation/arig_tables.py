@@ -1,9 +1,9 @@
 """Tables 1, 2 and 4 of the ARIG paper, without those metrics that need rendered video: FD, RPCC, SID and Var.
 
 The paper names its metrics without definitions; these are DIM's, whose rows it takes over (Frechet distance per clip,
-RPCC and Var flattened, SID in bits over 40 and 20 clusters of the truth). Its numbers are of 64 expression and 6 pose
-coefficients of Deep3DFaceRecon read off rendered video, ours of 52 blendshapes and 6 pose channels as sent: compare
-shapes. Tables 1 and 4 of the paper give RPCC, SID and Var of both parts together.
+RPCC and Var flattened, SID in bits over 40 and 20 clusters of the truth). Its numbers (`configs/papers.yaml`) are of 64
+expression and 6 pose coefficients of Deep3DFaceRecon read off rendered video, ours of 52 blendshapes and 6 pose
+channels as sent: compare shapes. Tables 1 and 4 of the paper give RPCC, SID and Var of both parts together.
 
 The papers' listeners as written are trained where they are missing, as `configs/training/KIND-as-written.yaml` says:
 size, steps and data of the shipped listener, and nothing beyond the paper. Their weights serve the tables alone.
@@ -12,9 +12,8 @@ size, steps and data of the shipped listener, and nothing beyond the paper. Thei
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -27,8 +26,8 @@ from sfms_robot.frames import POSE, SHAPES, Doubles
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation import metrics
-from sfms_robot.lab.evaluation.intervals import LEAST_SEEDS, Chosen, bootstrap, intervals, people_of, verdict
-from sfms_robot.lab.evaluation.listener_tables import collect, shared_space, spread_clips, table
+from sfms_robot.lab.evaluation.intervals import LEAST_SEEDS, Chosen, bootstrap, intervals, people_of, rounded, verdict
+from sfms_robot.lab.evaluation.listener_tables import PRINTED, collect, paper_rows, shared_space, spread_clips, table
 from sfms_robot.lab.evaluation.metrics import cut
 from sfms_robot.lab.evaluation.rollout import load_at_hop, rollouts
 from sfms_robot.lab.evaluation.tokenizer_tables import PAPER_TABLES as TOKENIZER_TABLES
@@ -45,51 +44,11 @@ Kind = Literal["sfms", "arig"]
 LABELS: Final = {"sfms": "SFMS, as written", "arig": "ARIG, as written"}
 ARIG_TABLES: Final = ("arig-1", "arig-2", "arig-4")
 CLIP_FRAMES: Final = 250
-PARTS: Final[Mapping[str, slice]] = {"exp": SHAPES, "pose": POSE}
+PARTS: Final = {"exp": SHAPES, "pose": POSE}
 _CLUSTERS: Final = {"exp": 40, "pose": 20}  # DIM's; the paper names none
 _NAMES: Final = tuple(f"{column} {part}" for column in ("FD", "RPCC", "SID", "Var") for part in PARTS)
 
-_PAPER_2: Final[Mapping[str, tuple[float | None, ...]]] = {  # table 2, on ViCo
-    "RLHG": (39.02, 0.07, 0.08, 0.02, 3.62, 3.17, 1.52, 0.02),
-    "L2L": (33.93, 0.06, 0.06, 0.08, 2.77, 2.66, 0.83, 0.02),
-    "DIM": (23.88, 0.06, 0.06, 0.03, 3.71, 2.35, 1.53, 0.02),
-    "INFP": (18.63, 0.07, None, None, 4.78, 3.92, 2.83, 0.18),
-    "ARIG": (18.39, 0.06, 0.05, 0.01, 4.82, 3.94, 2.91, 0.17),
-}
-_PAPER: Final[Mapping[int, Mapping[str, tuple[float, ...]]]] = {  # tables 1 (on RealTalk) and 4: RPCC, SID, Var
-    1: {
-        "DIM": (0.186, 1.083, 1.206),
-        "GT": (0.0, 2.902, 2.514),
-        "ARIG": (0.125, 2.428, 2.397),
-        "w/o long-range context": (0.140, 2.381, 2.326),
-        "w/o conversational state guidance": (0.127, 2.263, 2.174),
-        "w/o visual modality in IBU": (0.155, 2.115, 2.032),
-    },
-    4: {
-        "w/o continuous AR modeling": (0.129, 2.261, 2.154),
-        "w/o bidirectional-integrated learning": (0.173, 2.138, 2.016),
-        "ARIG": (0.125, 2.428, 2.397),
-    },
-}
-# Other readings of what the paper leaves open, trained beside table 1: changes of the training, of the listener.
-READINGS: Final[Mapping[str, Mapping[str, Mapping[str, Any]]]] = {
-    "ARIG, states fed back": {"phase_changes": {"own_states": True}},
-    "ARIG, fine noise levels": {"changes": {"diffusion": {"schedule": "logarithmic"}}},
-    "ARIG, both": {"phase_changes": {"own_states": True}, "changes": {"diffusion": {"schedule": "logarithmic"}}},
-}
 _LEAST_ALIKE: Final = 0.5  # variance of faces that can be compared, over people's; at most its inverse
-# Changes to the listener's configuration behind the ablations' rows.
-ABLATIONS: Final[Mapping[int, Mapping[str, Mapping[str, Any]]]] = {
-    1: {
-        "w/o long-range context": {"context_chunks": 4},
-        "w/o conversational state guidance": {"state_guidance": False},
-        "w/o visual modality in IBU": {"visual": False},
-    },
-    4: {
-        "w/o continuous AR modeling": {"discrete": True, "draws": "motion"},
-        "w/o bidirectional-integrated learning": {"interaction": "linear"},
-    },
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,37 +89,35 @@ def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str
     motions is constant.
     """
     seen = np.isfinite(speaker).all(axis=(1, 2))
-    found: dict[str, float] = {}
+    found = []
     for part, where in PARTS.items():
         real, ours, other = truth[..., where], made[..., where], speaker[..., where]
         moves = seen.any() and all(np.ptp(each[seen]) > 0 for each in (real, ours, other))
-        found |= {
-            f"FD {part}": metrics.frechet_distance(real, ours),
-            f"RPCC {part}": metrics.rpcc_flat(real[seen], ours[seen], other[seen]) if moves else float("nan"),
-            f"SID {part}": metrics.shannon_index(ours, centres[part], "bits"),
-            f"Var {part}": metrics.variance(ours),
-        }
-    return {name: found[name] for name in _NAMES}
+        found.append((
+            metrics.frechet_distance(real, ours),
+            metrics.rpcc_flat(real[seen], ours[seen], other[seen]) if moves else float("nan"),
+            metrics.shannon_index(ours, centres[part], "bits"),
+            metrics.variance(ours),
+        ))  # fmt: skip
+    return dict(zip(_NAMES, np.ravel(found, order="F").tolist(), strict=True))
 
 
 def rows_of(
-    number: int, truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles], people: Sequence[str] = ()
+    table: str, truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles], people: Sequence[str] = ()
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Return the rows of table 1, 2 or 4 (truth, ours by name, the paper's), and what holds of the paper's statements.
+    """Return the rows of a table (truth, ours by name, the paper's), and what holds of the paper's statements.
 
-    Rows of tables 1 and 4 have the paper's RPCC, SID and Var beside ours. Answers hold the clips of one training after
-    another. `people`: the listener of each clip of the truth, for intervals over them and over trainings.
+    Rows of `arig-1` and `arig-4` have the paper's RPCC, SID and Var beside ours. Answers hold the clips of one training
+    after another. `people`: the listener of each clip of the truth, for intervals over them and over trainings.
     """
 
     def row(name: str, source: str, values: Mapping[str, float | None]) -> dict[str, Any]:
-        return {"name": name, "source": source, "trainings": None} | {
-            key: None if value is None or not np.isfinite(value) else round(float(value), 5)
-            for key, value in values.items()
-        }
+        figures = {key: rounded(value, 5) for key, value in values.items()}
+        return {"name": name, "source": source, "trainings": None, **figures}
 
     centres, rows = metrics.centres_of(truth, PARTS, _CLUSTERS), []
     draws, count = dict[str, dict[str, Doubles]](), len(truth)
-    for name, made in {"Ground truth" if number == 2 else "GT": truth, **answers}.items():
+    for name, made in {"Ground truth" if table == "arig-2" else "GT": truth, **answers}.items():
 
         def score(clips: Chosen, made: Doubles = made) -> dict[str, float]:
             return scores(truth[clips % count], made[clips], speaker[clips % count], centres)
@@ -169,17 +126,17 @@ def rows_of(
         draws[name] = bootstrap(score, [*people] * trainings, np.repeat(range(trainings), count).tolist())
         all_clips = row(name, "here", score(np.arange(len(made))))
         rows.append({**all_clips, "trainings": trainings, "interval": intervals(draws[name])})
-    if number == 2:
-        paper_rows = [row(name, "paper", dict(zip(_NAMES, each, strict=True))) for name, each in _PAPER_2.items()]
-        return rows + paper_rows, []
-    said = claims(number, {each["name"]: each for each in rows}, draws, truth)
-    paper, columns = _PAPER[number], ("paper RPCC", "paper SID", "paper Var")
-    rows += [row(name, "paper", dict.fromkeys(_NAMES)) for name in paper.keys() - {each["name"] for each in rows}]
-    return [each | dict(zip(columns, paper.get(each["name"], (None,) * 3), strict=True)) for each in rows], said
+    paper = paper_rows(table)
+    if table == "arig-2":
+        return rows + [row(name, "paper", each) for name, each in paper.items()], []
+    said = claims(table, {each["name"]: each for each in rows}, draws, truth)
+    rows += [row(name, "paper", dict.fromkeys(_NAMES)) for name in paper if name not in draws]
+    unprinted = dict.fromkeys(PRINTED[table]["columns"])
+    return [each | paper.get(each["name"], unprinted) for each in rows], said
 
 
 def claims(
-    number: int, rows: Mapping[str, Mapping[str, Any]], draws: Mapping[str, Mapping[str, Doubles]], truth: Doubles
+    table: str, rows: Mapping[str, Mapping[str, Any]], draws: Mapping[str, Mapping[str, Doubles]], truth: Doubles
 ) -> list[dict[str, Any]]:
     """Return what holds of: with all parts more kinds of motion, an RPCC and a variance nearer to people's.
 
@@ -194,7 +151,7 @@ def claims(
         return bool(near and _LEAST_ALIKE * people <= own <= people / _LEAST_ALIKE)
 
     found = []
-    for name in (each for each in ABLATIONS[number] if draws.get("ARIG") and draws.get(each)):
+    for name in (each for each in PRINTED[table]["ablations"] if draws.get("ARIG") and draws.get(each)):
         enough = min(rows[each]["trainings"] for each in ("ARIG", name)) >= LEAST_SEEDS
         for part in PARTS:
             for metric in ("SID", "RPCC", "Var"):
@@ -232,33 +189,36 @@ def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bo
     """
     data, models, split = options.data, options.models, options.split
     scenes = open_scenes(data, split)
-    number = int(name.removeprefix("arig-"))
-    scene = "listening" if number == 2 else "interaction"
+    scene = "listening" if name == "arig-2" else "interaction"
     if scene not in scenes:
         raise ConfigError(f"{data / scene}: no {split} dyads, which --table {name} needs")
     held_out = [dyad for dyad in spread_clips(scenes[scene], options.clips) if len(dyad.listener) >= CLIP_FRAMES]
     if not held_out:
         raise ConfigError(f"{data}: no {split} dyad is as long as a clip of {CLIP_FRAMES} frames")
     folders = {one: [find("listeners", one, "config.yaml")] for one in names}
-    if number != 2 and train:
+    if name != "arig-2" and train:
         if models is None:
             raise ConfigError(f"--table {name}: needs --models DIR, where its listeners are trained and kept")
         unchanged = "arig-as-written" if options.training is None else "arig"
-        rows: dict[str, Mapping[str, Any]] = {"ARIG": {}, **(READINGS if number == 1 else {})}
-        rows |= {label: {"changes": changes} for label, changes in ABLATIONS[number].items()}
+        rows: dict[str, Mapping[str, Any]] = {"ARIG": {}, **PRINTED[name].get("readings", {})}
+        rows |= {label: {"changes": changes} for label, changes in PRINTED[name]["ablations"].items()}
         folders = {
             label: [
-                trained(
-                    "arig", models / (_folder(label) if differing else unchanged), data,
-                    file=options.training, steps=options.steps, seed=trial, changes=differing.get("changes", {}),
-                    phase_changes=differing.get("phase_changes", {}),
-                )
+                trained("arig", TrainOptions(
+                    file=options.training or training_file("arig"), data=data, steps=options.steps,
+                    out=models / (_folder(label) if differing else unchanged),
+                    seed=None if trial == 1 else trial, **differing,
+                ))
                 for trial in range(1, options.seeds + 1)
             ]
             for label, differing in rows.items()
         } | folders  # fmt: skip
     elif models is not None:
-        folders[LABELS["arig"]] = [trained("arig", models / "arig-as-written", data, steps=options.steps)]
+        folders[LABELS["arig"]] = [
+            trained("arig", TrainOptions(
+                file=training_file("arig"), data=data, out=models / "arig-as-written", steps=options.steps
+            ))
+        ]  # fmt: skip
     answers = {}
     for label, each in folders.items():
         rolled = [
@@ -269,9 +229,9 @@ def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bo
         answers[label] = cut(rolled, CLIP_FRAMES)
     truth, speaker = (cut([getattr(one, who) for one in held_out], CLIP_FRAMES) for who in ("listener", "speaker"))
     people = people_of(held_out, [len(dyad.listener) for dyad in held_out], CLIP_FRAMES)
-    scored, said = rows_of(number, truth, speaker, answers, people)
+    scored, said = rows_of(name, truth, speaker, answers, people)
     found = {"table": name, "split": split, "clips": len(truth), "frames": CLIP_FRAMES, "rows": scored}
-    return found if number == 2 else {**found, "claims": said}
+    return found if name == "arig-2" else {**found, "claims": said}
 
 
 def _folder(label: str) -> str:
@@ -283,40 +243,22 @@ def training_file(kind: Kind) -> Path:
     return data_dir("configs") / "training" / f"{kind}-as-written.yaml"
 
 
-def trained(
-    kind: Kind,
-    out: Path,
-    data: Path,
-    *,
-    file: Path | None = None,
-    steps: int | None = None,
-    seed: int = 1,
-    order: Order | None = None,
-    changes: Mapping[str, Any] = MappingProxyType({}),
-    phase_changes: Mapping[str, Any] = MappingProxyType({}),
-) -> Path:
-    """Return a folder with a listener of a paper, which is trained on `data` if it is missing: `out`, or OUT-seedN.
+def trained(kind: Kind, options: TrainOptions) -> Path:
+    """Return a folder with a listener of a paper, trained with `options` if it is missing: `out`, or OUT-seedN.
 
-    Training takes half an hour or more of one core; an interrupted one is resumed. `file`: of the training; None: as
-    written. `steps`: of every phase, in place of the file's. `changes`: of the listener; `phase_changes`: of ARIG's
-    training. Raises ConfigError.
+    Training takes half an hour or more of one core; an interrupted one is resumed. Raises ConfigError.
     """
-    file, out = file or training_file(kind), out if seed == 1 else out.with_name(f"{out.name}-seed{seed}")
-    if load_training(file).listener.kind != kind:
-        raise ConfigError(f"{file}: listener.kind is not {kind}")
+    out = options.out if options.seed is None else options.out.with_name(f"{options.out.name}-seed{options.seed}")
+    if load_training(options.file).listener.kind != kind:
+        raise ConfigError(f"{options.file}: listener.kind is not {kind}")
 
-    def options(job: str) -> TrainOptions:
-        begun = checkpoint_file(out, job).is_file()
-        return TrainOptions(
-            file=file, data=data, out=out, resume=begun, steps=steps, seed=None if seed == 1 else seed,
-            tensorboard=False, order=order,
-            changes=changes, phase_changes=phase_changes,
-        )  # fmt: skip
+    def begun(job: str) -> TrainOptions:
+        return replace(options, out=out, resume=checkpoint_file(out, job).is_file(), tensorboard=False)
 
     if not (out / checkpoint.WEIGHTS).is_file():
         if kind == "sfms" and not (out / TOKENIZER_WEIGHTS).is_file():
-            train_tokenizer(options("tokenizer"))
-        train_listener(options("listener" if kind == "sfms" else "arig"))
+            train_tokenizer(begun("tokenizer"))
+        train_listener(begun("listener" if kind == "sfms" else "arig"))
     return out
 
 
@@ -360,7 +302,10 @@ def sfms_table(number: int, names: Sequence[str], options: TableOptions) -> dict
     data, order, samples = options.data, options.order, options.samples
     listeners = {name: load_at_hop(name, options.hop, "auto") for name in names}
     if options.models is not None:
-        written = trained("sfms", options.models / "sfms-as-written", data, steps=options.steps, order=order)
+        written = trained("sfms", TrainOptions(
+            file=training_file("sfms"), data=data, out=options.models / "sfms-as-written", steps=options.steps,
+            order=order,
+        ))  # fmt: skip
         listeners[LABELS["sfms"]] = load_at_hop(str(written))
     space = shared_space(listeners)
     features = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
@@ -375,14 +320,10 @@ def sfms_table(number: int, names: Sequence[str], options: TableOptions) -> dict
 
 def _not_trained(name: str) -> dict[str, str]:
     """Return the missing rows of a table, and what makes them."""
-
-    def file(kind: Kind) -> str:
-        return "/".join(training_file(kind).parts[-3:])
-
     if name in TOKENIZER_TABLES:
         lacking = set(needed(name)) - set(needed(name, shipped=True))
-        return {row: f"evaluate tokenizer --table {name} --models DIR, minutes each" for row in sorted(lacking)}
+        return dict.fromkeys(sorted(lacking), f"evaluate tokenizer --table {name} --models DIR, minutes each")
     if name in _SFMS_TABLES:
-        return {LABELS["sfms"]: f"train tokenizer, then train listener, --config {file('sfms')}"}
-    rows = [LABELS["arig"]] if name == "arig-2" else ["ARIG", *ABLATIONS[int(name.removeprefix("arig-"))]]
-    return {row: f"train listener --config {file('arig')}" for row in rows}
+        return {LABELS["sfms"]: "train tokenizer, then train listener, --config configs/training/sfms-as-written.yaml"}
+    rows = [LABELS["arig"]] if name == "arig-2" else ["ARIG", *PRINTED[name]["ablations"]]
+    return dict.fromkeys(rows, "train listener --config configs/training/arig-as-written.yaml")

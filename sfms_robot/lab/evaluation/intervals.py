@@ -21,7 +21,6 @@ from sfms_robot.lab.corpora.clips import Dyad, series
 LEVEL: Final = 0.95
 DRAWS: Final = 2000
 _DEFINED: Final = 0.9  # share of the draws in which a figure has to be defined to have an interval
-POOLED_DRAWS: Final = 200  # of metrics that pool all clips
 LEAST_SEEDS: Final = 3  # trainings, for what a paper states
 _LEAST_PEOPLE: Final = 3
 
@@ -44,9 +43,9 @@ def ends(values: Doubles) -> Doubles:
     return np.asarray(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
 
 
-def rounded(value: float) -> float | None:
-    """Return a figure as reports have it; None if it is not finite."""
-    return round(float(value), 4) if np.isfinite(value) else None
+def rounded(value: float | None, digits: int = 4) -> float | None:
+    """Return a figure as reports have it; None without one, or if it is not finite."""
+    return None if value is None or not np.isfinite(value) else round(float(value), digits)
 
 
 def mean_interval(values: Doubles) -> list[float | None]:
@@ -148,7 +147,7 @@ def bootstrap(
     people: Sequence[str],
     runs: Sequence[int] = (),
     seed: int = 0,
-    draws: int = POOLED_DRAWS,
+    draws: int = 200,
 ) -> dict[str, Doubles]:
     """Return each figure of `score(clips)` in `draws` sets of people (R,), NaN where it is not finite.
 

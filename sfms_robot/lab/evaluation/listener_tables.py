@@ -3,7 +3,8 @@
 The paper does not say how its numbers were computed; each choice is stated where it is made. Table 1 is that of the
 Learning2Listen line, expression and rotation apart; table 2 that of the REACT challenge, which scores 25 attributes
 that no public code derives from coefficients: here it is computed on the coefficients, with ReactFace's FRDist. FRRea
-needs rendered pictures and is out of scope. The paper's rows come from other data and spaces: compare their shapes.
+needs rendered pictures and is out of scope. The paper's rows (`configs/papers.yaml`) come from other data and spaces:
+compare their shapes.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ import torch
 from sfms_robot import config
 from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
+from sfms_robot.config.base import read
+from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, SPACE_CHANNELS, Doubles
 from sfms_robot.lab.corpora.clips import Dyad
@@ -52,32 +55,15 @@ from sfms_robot.ports import Listener
 
 FRAMES: Final = {1: 64, 2: 750}  # of a clip: Learning2Listen's and REACT's
 _LEAST_SPREAD: Final = 1e-6  # smaller spreads would divide by nearly nothing
-_COLUMNS_1: Final = ("L2", "FD", "Var", "SI", "P-FD", "RPCC")
-_COLUMNS_2: Final = ("FRCorr", "FRDist", "FRDiv", "FRVar", "FRDvs", "FRSyn")
 
-# Tables I and II of the paper, in its units; None where it leaves a cell out.
-_NONE: Final = (None,) * 6
-_PAPER_1: Final = {  # per part: L2, FD, Var, SI, P-FD, RPCC
-    "Ground truth": ((None, 0.0, 2.90, 2.61, None, None), (None, None, 0.81, 1.96, None, None)),
-    "Random": ((129.34, 524.69e3, 62.23, 1.17, 526.46e3, 0.08), (27.67, 257.06e2, 62.39, 1.06, 257.16e2, 0.002)),
-    "Median": ((43.18, 97.86e3, 0.0, 0.0, None, None), _NONE),
-    "LFI": ((50.07, 43.63e3, 1.15, 1.33, 54.34e3, 0.8), (9.00, 9.80e2, 0.17, 1.07, 12.36e2, 0.034)),
-    "Learning2Listen": ((33.16, 3.55e3, 2.01, 2.48, 5.15e3, 0.02), (4.75, 0.81e2, 0.62, 1.82, 0.87e2, 0.0)),
-    "ELP": ((None, 1.37e3, 2.70, 2.15, None, 0.014), (None, 0.36e2, 0.59, 1.60, None, 0.077)),
-    "SFMS": ((26.65, 1.13e3, 2.17, 2.63, 1.35e3, 0.0023), (4.02, 0.68e2, 0.83, 2.03, 0.73e2, 0.006)),
-}
-_PAPER_2: Final = {  # FRCorr, FRDist, FRDiv, FRVar, FRDvs, FRSyn
-    "Ground truth": (0.85, 0.0, 0.0, 0.0724, 0.2483, 47.69),
-    "Random": (0.05, 237.23, 0.1667, 0.0833, 0.1667, 44.10),
-    "Mime": (0.38, 92.94, 0.0, 0.0724, 0.2483, 38.54),
-    "MeanFr": (0.0, 97.86, 0.0, 0.0, 0.0, 49.0),
-    "Trans-VAE": (0.07, 90.31, 0.0064, 0.0012, 0.0009, 44.65),
-    "BeLFusion": (0.12, 94.09, 0.0379, 0.0248, 0.0397, 49.0),
-    "Dense-FSQ": (0.31, 84.93, 0.1164, 0.0348, 0.1166, 47.42),
-    "SFMS": (0.84, 66.89, 0.1207, 0.0871, 0.1212, 45.66),
-}
-
+PRINTED: Final = read(data_dir("configs") / "papers.yaml")
 Score = Callable[[Chosen], dict[str, Any]]  # figures of some of the clips
+
+
+def paper_rows(table: str) -> dict[str, dict[str, float | None]]:
+    """Return the rows that a paper prints in a table, by name: its figures by column; None where it leaves one out."""
+    printed = PRINTED[table]
+    return {name: dict(zip(printed["columns"], row, strict=True)) for name, row in printed["rows"].items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,12 +96,7 @@ def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: in
         score = score_of(motion)
         over = intervals(bootstrap(score, clips.people)) if name in answers else {}
         rows.append({"name": name, "source": "here", **score(np.arange(len(clips.truth))), "interval": over})
-    if number == 1:
-        keys = [f"{part} {column}" for part in metrics.CLUSTERS for column in _COLUMNS_1]
-        paper = {name: dict(zip(keys, [*first, *second], strict=True)) for name, (first, second) in _PAPER_1.items()}
-    else:
-        paper = {name: dict(zip(_COLUMNS_2, row, strict=True)) for name, row in _PAPER_2.items()}
-    rows += [{"name": name, "source": "paper", **row} for name, row in paper.items()]
+    rows += [{"name": name, "source": "paper", **row} for name, row in paper_rows(f"sfms-{number}").items()]
     return {
         "table": number,
         "space": clips.space,
@@ -176,19 +157,18 @@ def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
         row: dict[str, Any] = {}
         for part, where in metrics.PARTS[clips.space].items():
             own, person = truth[chosen][..., where], speaker[chosen][..., where]
-            values = [
-                (
-                    metrics.l2(own, guess),
-                    metrics.frechet_distance(own, guess),
-                    metrics.variance(guess),
-                    metrics.shannon_index(guess, centres[part]),
-                    metrics.paired_frechet_distance(own, guess, person),
-                    metrics.rpcc_flat(own, guess, person) if np.ptp(guess) else float("nan"),
-                )
+            samples = [
+                {
+                    "L2": metrics.l2(own, guess),
+                    "FD": metrics.frechet_distance(own, guess),
+                    "Var": metrics.variance(guess),
+                    "SI": metrics.shannon_index(guess, centres[part]),
+                    "P-FD": metrics.paired_frechet_distance(own, guess, person),
+                    "RPCC": metrics.rpcc_flat(own, guess, person) if np.ptp(guess) else float("nan"),
+                }
                 for guess in (scaled(pred[chosen, k])[..., where] for k in range(pred.shape[1]))
             ]
-            means = (float(np.mean(column)) for column in zip(*values, strict=True))
-            row |= {f"{part} {name}": value for name, value in zip(_COLUMNS_1, means, strict=True)}
+            row |= {f"{part} {name}": float(np.mean([one[name] for one in samples])) for name in samples[0]}
         return row
 
     return lambda pred: partial(score, pred)
@@ -225,9 +205,15 @@ def _table_2(clips: Clips, pred: Doubles) -> Score:
     def score(chosen: Chosen) -> dict[str, Any]:
         correlation, distance, diverse, varied = by_clip[chosen].mean(axis=0).tolist()
         known = lags[chosen][np.isfinite(lags[chosen])]
-        synchrony = float(known.mean()) if len(known) else float("nan")
-        values = (correlation * pred.shape[1], distance, diverse, varied, metrics.frdvs(pred[chosen]), synchrony)
-        return dict(zip(_COLUMNS_2, values, strict=True)) | {"FRCorr per sample": correlation}
+        return {
+            "FRCorr": correlation * pred.shape[1],
+            "FRDist": distance,
+            "FRDiv": diverse,
+            "FRVar": varied,
+            "FRDvs": metrics.frdvs(pred[chosen]),
+            "FRSyn": float(known.mean()) if len(known) else float("nan"),
+            "FRCorr per sample": correlation,
+        }
 
     return score
 

@@ -1,10 +1,7 @@
 """The tokenizers that tables III and IV of the SFMS paper compare: recipes by name, networks, one interface, files.
 
-Sizes: "small" has width 64, about a fifth of a million parameters, and takes one to two minutes each on one core;
-"paper" has about the parameters of table IV, for a GPU. Names state the content: sparse-all-k10 has a keyframe set for
-each channel and 10 keyframes a window; as-written ones have the paper's scores, learned by Algorithm 1, and its
-inpainter, which is not added to straight lines. NAME-seed2 is NAME trained with seed 2. The baselines have one code a
-frame, or one every eight frames.
+The recipes are those of `configs/tokenizer_tables.yaml`. NAME-seed2 is NAME trained with seed 2. The baselines have one
+code a frame, or one every eight frames.
 """
 
 from __future__ import annotations
@@ -12,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import torch
 import yaml
@@ -21,8 +18,10 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.config import load, parse
+from sfms_robot.config.base import read
 from sfms_robot.config.training import HALVINGS
-from sfms_robot.frames import BLENDSHAPES, CHANNELS
+from sfms_robot.data import data_dir
+from sfms_robot.frames import CHANNELS
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.layers import Block, places_of
 from sfms_robot.listeners.sfms.model import Tokenizer
@@ -30,73 +29,8 @@ from sfms_robot.listeners.sfms.placement import Strategy
 from sfms_robot.listeners.sfms.quantizer import Codebook, Grid
 
 SizeName = Literal["small", "paper"]
-KEYFRAMES: Final = (3, 7, 10)  # of table III
-AS_WRITTEN: Final = "as-written"
+COMPARED: Final = read(data_dir("configs") / "tokenizer_tables.yaml")
 _SEED: Final = "-seed"
-
-# Of each size: width, layers of each part of the sparse inpainter, layers on either side of a baseline's codes, width
-# of the scores, training.
-SIZES: Final[dict[str, tuple[int, int, int, int, dict[str, Any]]]] = {
-    "small": (
-        64, 1, 2, 32,
-        {"steps": 1000, "batch": 16, "learning_rate": 2e-3, "score_learning_rate": 3e-3, "score_tracks": 16},
-    ),
-    "paper": (
-        256, 4, 12, 128,
-        {
-            "steps": 20_000, "batch": 128, "learning_rate": 3e-4, "score_learning_rate": 3e-4, "precision": "bf16",
-            "score_tracks": 64,
-        },
-    ),
-}  # fmt: skip
-_SCALAR: Final = (256,)  # of one channel: four coarse digits of one number are harder to learn, twice the error
-_PAPER: Final = {"placement": "learned_paper", "inpainter": "paper"}
-_ALIKE: Final = {"quantizer": "vq", "squashed": True}
-_ALL: Final = {"preset": "all", "levels": _SCALAR}
-_ONE: Final = {"preset": "one", "levels": (4, 4, 4, 4), "keyframes": 10}
-_LONGER: Final = (8_000, 30_000)  # steps: is Algorithm 1 given too few, or does it collapse?
-_PLACED: Final[dict[str, dict[str, Any]]] = {  # table III: what differs, by the ending of the name
-    "": {},
-    "-static": {"placement": "static"},
-    "-static_paper": {"placement": "static_paper"},
-    "-algorithm-1": {"placement": "learned_paper"},
-    "-paper-inpainter": {"inpainter": "paper"},
-    "-static-paper-inpainter": {"placement": "static", "inpainter": "paper"},
-    "-static_paper-paper-inpainter": {"placement": "static_paper", "inpainter": "paper"},
-    f"-{AS_WRITTEN}": _PAPER,
-    f"-{AS_WRITTEN}-tempered": _PAPER,
-    f"-{AS_WRITTEN}-slower-scores": _PAPER,
-}
-_TRAINED: Final[dict[str, dict[str, Any]]] = {  # how training differs, by the ending of the name
-    "-tempered": {"tempered_draws": True},
-    "-slower-scores": {"score_learning_rate": 3e-4},
-    **{f"-{steps}": {"steps": steps} for steps in _LONGER},
-}
-_SPARSE: Final[dict[str, dict[str, Any]]] = {  # the groups and what else differs, by name
-    **{
-        f"sparse-all-k{k}{ending}": {"groups": _ALL | {"keyframes": k}, **changes}
-        for k in KEYFRAMES
-        for ending, changes in _PLACED.items()
-    },
-    **{f"sparse-all-k7-{AS_WRITTEN}-{steps}": {"groups": _ALL | {"keyframes": 7}, **_PAPER} for steps in _LONGER},
-    "sparse-all-k7-adaptive": {"groups": _ALL | {"keyframes": 7}, **_PAPER, "placement": "adaptive"},
-    "sparse-one-k10": {"groups": _ONE},
-    "sparse-one-k10-static_paper": {"groups": _ONE, "placement": "static_paper"},
-    "sparse-all-k10-vq-256": {"groups": _ALL | {"keyframes": 10}, "quantizer": "vq"},  # table IV
-    f"sparse-all-k10-vq-256-{AS_WRITTEN}": {"groups": _ALL | {"keyframes": 10}, "quantizer": "vq", **_PAPER},
-    # As many dimensions, squashed alike, and so as many weights as the grid's.
-    "sparse-all-k10-vq-256-1d": {"groups": _ALL | {"keyframes": 10}, **_ALIKE, "code_dims": 1},
-    "sparse-all-k10-fsq-4444": {"groups": _ALL | {"keyframes": 10, "levels": (4, 4, 4, 4)}},
-    "sparse-all-k10-vq-256-4d": {"groups": _ALL | {"keyframes": 10}, **_ALIKE, "code_dims": 4},
-}
-_BASELINES: Final = {  # kind, quantizer, levels
-    "dense-vq-1024": ("dense", "vq", (1024,)),
-    "l2l-vq-256": ("grouped", "vq", (256,)),
-    "dense-fsq-1024": ("dense", "fsq", (8, 5, 5, 5)),
-    "dense-fsq-32": ("dense", "fsq", (8, 4)),  # figure 6
-    "dense-fsq-200": ("dense", "fsq", (8, 5, 5)),
-}
-NAMES: Final = (*_SPARSE, *_BASELINES)
 
 
 def seeded(name: str, seeds: int) -> list[str]:
@@ -105,22 +39,13 @@ def seeded(name: str, seeds: int) -> list[str]:
 
 
 def recipe_of(name: str, size: SizeName = "small", steps: int | None = None) -> config.Recipe:
-    """Return the recipe of a tokenizer of `NAMES`, perhaps with the seed of its name."""
+    """Return the recipe of a tokenizer by name, perhaps with the seed of its name."""
     base, _, seed = name.partition(_SEED)
-    width, layers, baseline_layers, score_width, training = SIZES[size]
-    training = {**training, "evaluate_every": 0}
-    if base in _BASELINES:
-        kind, quantizer, levels = _BASELINES[base]
-        model = {"kind": kind, "quantizer": quantizer, "levels": levels, "width": width, "layers": baseline_layers}
-        training["commitment"] = 0.25  # the encoder term of Learning2Listen's published configuration
-    else:
-        model = {
-            "kind": "sfms", "placement": "learned", "tokenizer_width": width, "tokenizer_layers": layers,
-            "scores": {"width": score_width}, "quantizer": "fsq", "inpainter": "residual", **_SPARSE[base],
-        }  # fmt: skip
-    for ending, changes in _TRAINED.items():
-        training |= changes if base.endswith(ending) else {}
-    training |= {} if steps is None else {"steps": steps}
+    recipe, usual = COMPARED["recipes"][base], COMPARED["sizes"][size]
+    training = {**usual["training"], "evaluate_every": 0, **recipe.get("training", {})}
+    if steps is not None:
+        training["steps"] = steps
+    model = usual[recipe["model"]["kind"]] | recipe["model"]
     return parse(config.Recipe, {"model": model, "training": training, "seed": int(seed or 1)}, name)
 
 
@@ -261,8 +186,7 @@ def baseline_loss(
 _CHUNK: Final = 64  # windows at a time
 _FREE_PLACES: Final = ("static", "static_paper")  # the reader knows where these keyframes are
 # Smallest deviation that a channel is divided by: rad, m, of 0..1. Smaller motion is noise.
-_STILL: Final = {"roll": 0.01, "pitch": 0.01, "yaw": 0.01, "x": 0.005, "y": 0.005, "z": 0.005}
-_STILL_SHAPE: Final = 0.02
+_STILL: Final = [0.01] * 3 + [0.005] * 3 + [0.02] * 52
 
 
 class TableModel(nn.Module):
@@ -291,9 +215,8 @@ class TableModel(nn.Module):
 
     def fit_scales(self, motion: Tensor) -> None:
         """Set means and deviations from motion (N, 58)."""
-        least = torch.tensor([_STILL_SHAPE if name in BLENDSHAPES else _STILL[name] for name in CHANNELS])
         self.motion_mean.copy_(motion.mean(0))
-        self.motion_std.copy_(torch.maximum(motion.std(0), least))
+        self.motion_std.copy_(torch.maximum(motion.std(0), torch.tensor(_STILL)))
 
     def standardise(self, motion: Tensor) -> Tensor:
         return (motion - self.motion_mean) / self.motion_std

@@ -1,7 +1,8 @@
 """`evaluate tokenizer --table`: tables III and IV of the SFMS paper on any folder of faces, and figures 9 and 10.
 
 Two more tables say what the figures of those two come from: `3-placements` has every placement with the paper's
-inpainter and with ours, `4-codes` both kinds of code with the same dimensions, and without rounding.
+inpainter and with ours, `4-codes` both kinds of code with the same dimensions, and without rounding. The rows of all
+are in `configs/tokenizer_tables.yaml`.
 
 A row is a tokenizer, perhaps with another placement of keyframes, beside the paper's figure. The paper's figures are of
 other motion (Learning2Listen, 56 FLAME coefficients), other training and unknown units: only how many times one row is
@@ -19,7 +20,7 @@ from __future__ import annotations
 
 import fnmatch
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -27,6 +28,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from torch import Tensor
 
 from sfms_robot.app.progress import tracked
@@ -37,8 +39,7 @@ from sfms_robot.lab.corpora.clips import read_takes
 from sfms_robot.lab.evaluation.intervals import LEAST_SEEDS, verdict
 from sfms_robot.lab.evaluation.metrics import dtw
 from sfms_robot.lab.evaluation.table_tokenizers import (
-    AS_WRITTEN,
-    KEYFRAMES,
+    COMPARED,
     SizeName,
     TableModel,
     load_tokenizer,
@@ -54,12 +55,10 @@ from sfms_robot.signals.tracks import Take, folder_takes
 ALL: Final = "all"
 DYNAMIC: Final = "Dynamic (learned, ours)"
 DYNAMIC_AS_WRITTEN: Final = "Dynamic (Algorithm 1, as written)"
-_ALGORITHM_1: Final = "Algorithm 1"
 _STATIC, _CENTRED, _EXACT = "Static (every N/k-th)", "Static, centred", "Exact"
-_UNEQUAL: Final = "unequal bits"
-_WINDOW_FRAMES: Final = 48  # of every recipe, as in the paper
+_BESIDE: Final = {"static": _STATIC, "static_centred": _CENTRED}
+_KEYFRAMES: Final = (3, 7, 10)  # of table III
 _ANGLES: Final = slice(CHANNEL_INDEX["roll"], CHANNEL_INDEX["yaw"] + 1)
-_CLUSTERS: Final = 8
 _ROUNDS: Final = 20
 
 log = logging.getLogger(__name__)
@@ -77,7 +76,6 @@ class Spec:
         placement: Where it differs from the tokenizer's.
         rounded: Restored from codes; else from what they were chosen by.
         paper_e2: The paper's MSE, times 100.
-        shipped: The tokenizer is in the checkout; others are trained if there is a folder for them.
     """
 
     name: str
@@ -87,95 +85,16 @@ class Spec:
     rounded: bool = True
     paper_e2: float | None = None
     note: str = ""
-    shipped: bool = True
 
 
-_PAPER_3: Final = tuple(zip(KEYFRAMES, (0.89, 0.64, 0.33), (0.15, 0.13, 0.12), strict=True))  # k, static, dynamic
-
-
-def _table_3() -> Iterable[Spec]:
-    yield Spec(name="VQ-only (no keyframe)", tokenizer="dense-vq-1024", paper_e2=0.26)
-    for k, static, dynamic in _PAPER_3:
-        own = f"sparse-all-k{k}"
-        yield Spec(name=_STATIC, tokenizer=f"{own}-static_paper", k=k, paper_e2=static)
-        yield Spec(name=_CENTRED, tokenizer=f"{own}-static", k=k)
-        yield Spec(name=DYNAMIC_AS_WRITTEN, tokenizer=f"{own}-{AS_WRITTEN}", k=k, paper_e2=dynamic, shipped=False)
-        yield Spec(name=DYNAMIC, tokenizer=own, k=k, paper_e2=dynamic)
-        yield Spec(name=_EXACT, tokenizer=own, k=k, placement="exact")
-    own, one_set = "sparse-one-k10", "G = 1"
-    yield Spec(name=_STATIC, tokenizer=f"{own}-static_paper", k=10, note=one_set)
-    yield Spec(name=DYNAMIC, tokenizer=own, k=10, note=one_set)
-    yield Spec(name=_EXACT, tokenizer=own, k=10, placement="exact", note=one_set)
-
-
-def _table_4() -> Iterable[Spec]:
-    yield Spec(name="L2L (VQ-256)", tokenizer="l2l-vq-256", paper_e2=1.44)
-    yield Spec(name="Dense-FSQ-1024", tokenizer="dense-fsq-1024", paper_e2=0.73)
-    for codes in (32, 200):  # figure 6
-        yield Spec(name=f"Dense-FSQ-{codes}", tokenizer=f"dense-fsq-{codes}", shipped=False)
-    for name, own, paper_e2 in (
-        ("Sparse-VQ-256", "sparse-all-k10-vq-256", 0.05),
-        ("Sparse-FSQ-256", "sparse-all-k10", 0.03),
-    ):
-        for ending, suffix in ((", as written", f"-{AS_WRITTEN}"), ("", "")):
-            yield Spec(
-                name=name + ending, tokenizer=own + suffix, k=10, paper_e2=paper_e2, note=_UNEQUAL, shipped=not ending
-            )
-
-
-_INPAINTERS: Final = {"paper": "the paper's inpainter", "ours": "our inpainter"}
-_BESIDE: Final = {"static": _STATIC, "static_centred": _CENTRED}
-
-
-def _placements() -> Iterable[Spec]:
-    """Yield every placement with each inpainter, the paper's k = 7 first, and the readings of Algorithm 1."""
-    written, lines = f"-{AS_WRITTEN}", "-paper-inpainter"
-    rows = (
-        (_STATIC, "paper", f"-static_paper{lines}"), (_CENTRED, "paper", f"-static{lines}"),
-        (_ALGORITHM_1, "paper", written), (DYNAMIC, "paper", lines),
-        (_STATIC, "ours", "-static_paper"), (_CENTRED, "ours", "-static"),
-        (_ALGORITHM_1, "ours", "-algorithm-1"), (DYNAMIC, "ours", ""),
-        ("Algorithm 1, drawn as (6) reads", "paper", f"{written}-tempered"),
-        ("Algorithm 1, scores learn at 3e-4", "paper", f"{written}-slower-scores"),
-    )  # fmt: skip
-    for k in (7, 3, 10):
-        for name, inpainter, ending in rows:
-            yield Spec(
-                name=name,
-                tokenizer=f"sparse-all-k{k}{ending}",
-                k=k,
-                note=_INPAINTERS[inpainter],
-                shipped=inpainter == "ours" and name != _ALGORITHM_1,
-            )
-        for name, ending in (
-            ("Algorithm 1, 8,000 steps", f"{written}-8000"), ("Algorithm 1, 30,000 steps", f"{written}-30000"),
-            ("Adaptive k, equation (8)", "-adaptive"),
-        ) if k == 7 else ():  # fmt: skip
-            yield Spec(name=name, tokenizer=f"sparse-all-k7{ending}", k=7, note=_INPAINTERS["paper"], shipped=False)
-
-
-def _codes() -> Iterable[Spec]:
-    """Yield grids and learned vectors of as many dimensions, with and without choosing a code."""
-    for name, own, shipped in (
-        ("FSQ-256, 1 dimension", "sparse-all-k10", True),
-        ("VQ-256, 1 dimension, squashed", "sparse-all-k10-vq-256-1d", False),
-        ("FSQ-4x4x4x4", "sparse-all-k10-fsq-4444", False),
-        ("VQ-256, 4 dimensions, squashed", "sparse-all-k10-vq-256-4d", False),
-        ("VQ-256, 4 dimensions", "sparse-all-k10-vq-256", True),
-    ):
-        for ending, rounded in (("", True), (", not rounded", False)):
-            yield Spec(name=name + ending, tokenizer=own, k=10, rounded=rounded, shipped=shipped)
-
-
-TABLES: Final = {
-    "3": tuple(_table_3()), "4": tuple(_table_4()), "3-placements": tuple(_placements()), "4-codes": tuple(_codes()),
-}  # fmt: skip
+TABLES: Final = TypeAdapter(dict[str, tuple[Spec, ...]]).validate_python(COMPARED["tables"])
 PAPER_TABLES: Final = ("3", "4")
 
 
 def needed(name: str, shipped: bool = False) -> list[str]:
     """Return the names of the tokenizers that a table compares; with `shipped` only those in the checkout."""
-    return list(dict.fromkeys(spec.tokenizer for spec in TABLES[name] if spec.shipped or not shipped))
+    found = dict.fromkeys(spec.tokenizer for spec in TABLES[name])
+    return [one for one in found if one in COMPARED["shipped"] or not shipped]
 
 
 def build(
@@ -303,9 +222,8 @@ def _doubles(motion: Tensor) -> Doubles:
 
 def _ratios(name: str, rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
     """Return the ratios of a paper's table; empty of another one, and where rows are left out."""
-    if name not in PAPER_TABLES or not {spec.name for spec in TABLES[name] if spec.shipped} <= {
-        r["name"] for r in rows
-    }:
+    wanted = {spec.name for spec in TABLES[name] if spec.tokenizer in COMPARED["shipped"]}
+    if name not in PAPER_TABLES or not wanted <= {row["name"] for row in rows}:
         return {}
     return ratios_3(rows) if name == "3" else ratios_4(rows)
 
@@ -313,31 +231,33 @@ def _ratios(name: str, rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 def ratios_3(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
     """Return the MSE of dynamic over other placements by k, one keyframe set per channel, here and in the paper."""
     mse = {(row["name"], row["k"]): row["mse"] for row in rows if not row["note"]}
-    pairs = {"static": (DYNAMIC, _STATIC), "static_centred": (DYNAMIC, _CENTRED), "exact": (DYNAMIC, _EXACT)}
+    paper_e2 = {(spec.name, spec.k): spec.paper_e2 or np.nan for spec in TABLES["3"] if not spec.note}
+    pairs = {f"dynamic_to_{key}": (DYNAMIC, other) for key, other in {**_BESIDE, "exact": _EXACT}.items()}
+    pairs["as_written_to_static"] = (DYNAMIC_AS_WRITTEN, _STATIC)
     found = {
-        f"dynamic_to_{key}": {str(k): mse[ours, k] / mse[other, k] for k in KEYFRAMES}
+        key: {str(k): mse[ours, k] / mse[other, k] for k in _KEYFRAMES}
         for key, (ours, other) in pairs.items()
+        if all((ours, k) in mse for k in _KEYFRAMES)
     }
-    if all((DYNAMIC_AS_WRITTEN, k) in mse for k in KEYFRAMES):
-        found["as_written_to_static"] = {str(k): mse[DYNAMIC_AS_WRITTEN, k] / mse[_STATIC, k] for k in KEYFRAMES}
-    paper = {str(k): round(dynamic / static, 2) for k, static, dynamic in _PAPER_3}
+    paper = {str(k): round(paper_e2[DYNAMIC, k] / paper_e2[_STATIC, k], 2) for k in _KEYFRAMES}
     return {**found, "paper_dynamic_to_static": paper}
 
 
 def ratios_4(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Return the MSE of Sparse-FSQ-256, ours and as written, over the dense and the grouped tokenizer."""
     mse = {row["name"]: row["mse"] for row in rows}
+    paper_e2 = {spec.name: spec.paper_e2 or np.nan for spec in TABLES["4"]}
     ours = {"sparse_fsq": "Sparse-FSQ-256", "sparse_fsq_as_written": "Sparse-FSQ-256, as written"}
-    others = {"dense": ("Dense-FSQ-1024", 0.73), "l2l": ("L2L (VQ-256)", 1.44)}
-    return {
-        **{
-            f"{key}_to_{beside}": mse[name] / mse[other]
-            for key, name in ours.items()
-            if name in mse
-            for beside, (other, _) in others.items()
-        },
-        **{f"paper_sparse_fsq_to_{beside}": round(0.03 / paper_e2, 3) for beside, (_, paper_e2) in others.items()},
+    others = {"dense": "Dense-FSQ-1024", "l2l": "L2L (VQ-256)"}
+    found = {
+        f"{key}_to_{beside}": mse[name] / mse[other]
+        for key, name in ours.items()
+        if name in mse
+        for beside, other in others.items()
     }
+    for beside, other in others.items():
+        found[f"paper_sparse_fsq_to_{beside}"] = round(paper_e2["Sparse-FSQ-256"] / paper_e2[other], 3)
+    return found
 
 
 # --- clusters -------------------------------------------------------------------------------------------------------
@@ -346,7 +266,7 @@ def ratios_4(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
 Clusters = tuple[NDArray[np.intp], NDArray[np.intp]]  # the window that is each medoid (K,); each window's cluster (W,)
 
 
-def cluster(motion: Doubles, count: int = _CLUSTERS) -> Clusters:
+def cluster(motion: Doubles, count: int = 8) -> Clusters:
     """Cluster windows (W, T, C): start with medoids far apart, then move each to the centre of its cluster.
 
     At most half as many clusters as windows.
@@ -453,7 +373,7 @@ def evaluate_table(
     if not wanted:
         raise ConfigError(f"--only {only}: expected a pattern of tokenizers of this table (valid: {', '.join(names)})")
     if missing := wanted if train else missing_in(folder, wanted, may_train=models is not None):
-        examples = Windows.of(recorded["held_out"], _WINDOW_FRAMES).motion
+        examples = Windows.of(recorded["held_out"], 48).motion  # the length of every recipe, as in the paper
         train_all(missing, folder, recorded["train"], examples, size=size, steps=steps, jobs=jobs, again=train)
     loaded = {name: load_tokenizer(folder / name) for name in wanted}
     first_name, first = next(iter(loaded.items()))

@@ -9,7 +9,7 @@ import yaml
 from tiny_arig_training import dyad, settings, write
 
 from sfms_robot.lab.corpora import clips
-from sfms_robot.lab.evaluation.arig_tables import _PAPER, _PAPER_2, READINGS
+from sfms_robot.lab.evaluation.listener_tables import PRINTED
 from sfms_robot.lab.learning.arig.trainer import train_arig
 
 TABLE_2 = ("evaluate", "listener", "--table", "arig-2")
@@ -68,11 +68,16 @@ def test_interaction_is_for_listeners_that_speak(command_line, data):
 def test_table_2_has_a_row_for_every_listener_given_and_the_papers(command_line, listener, lively):
     ended = command_line(*TABLE_2, "--listener", listener, "--listener", "sfms-small", "--data", lively, "--json")
     assert ended.code == 0
-    assert [row["name"] for row in ended.told["rows"]] == ["Ground truth", str(listener), "sfms-small", *_PAPER_2]
+    assert [row["name"] for row in ended.told["rows"]] == [
+        "Ground truth",
+        str(listener),
+        "sfms-small",
+        *PRINTED["arig-2"]["rows"],
+    ]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("table", "paper"), [("arig-1", _PAPER[1]), ("arig-4", _PAPER[4])])
+@pytest.mark.parametrize(("table", "paper"), [(name, PRINTED[name]) for name in ("arig-1", "arig-4")])
 def test_ablations_that_are_missing_are_trained_and_kept(command_line, listener, lively, tmp_path, table, paper):
     file = tmp_path / "arig.yaml"
     file.write_text(yaml.safe_dump(settings(steps=2).model_dump(mode="json")))
@@ -80,7 +85,7 @@ def test_ablations_that_are_missing_are_trained_and_kept(command_line, listener,
     words += ("--models", tmp_path / "m", "--config", file, "--json")
     ended = command_line(*words)
     assert ended.code == 0 and {row["name"] for row in ended.told["rows"]} == {
-        "GT", *paper, str(listener), *(READINGS if table == "arig-1" else ()),
+        "GT", *paper["rows"], str(listener), *paper.get("readings", ()),
     }  # fmt: skip
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "m").rglob("*.safetensors")}
     assert command_line(*words).out == ended.out and before == {path: path.stat().st_mtime_ns for path in before}

@@ -16,7 +16,7 @@ from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.lab.corpora.clips import read_takes
 from sfms_robot.lab.evaluation import tokenizer_tables
 from sfms_robot.lab.evaluation.table_tokenizers import (
-    NAMES,
+    COMPARED,
     TableModel,
     keyframe_bits,
     load_tokenizer,
@@ -33,7 +33,7 @@ from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.placement import place_exact
 from sfms_robot.signals.tracks import Take
 
-RECIPES = {name: recipe_of(name, steps=3) for name in NAMES}
+RECIPES = {name: recipe_of(name, steps=3) for name in COMPARED["recipes"]}
 TRAINING = {"steps": 3, "batch": 2, "learning_rate": 1e-3, "evaluate_every": 0, "score_tracks": 4}
 
 
@@ -150,6 +150,7 @@ def test_names_say_seed_steps_and_learning_rate_and_every_table_needs_only_recip
         assert set(tokenizer_tables.needed(name)) <= set(RECIPES)
     every = {name for table in tokenizer_tables.TABLES for name in tokenizer_tables.needed(table)}
     assert every == set(RECIPES), "none is trained in vain"
+    assert {*COMPARED["shipped"]} == {folder.name for folder in (data_dir("configs") / "tokenizers").iterdir()}
     assert [recipe_of(name).seed for name in seeded("sparse-all-k3", 3)] == [1, 2, 3]
     written = "sparse-all-k7-as-written"
     assert (
