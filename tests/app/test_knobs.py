@@ -12,7 +12,7 @@ from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import MOTION_DIM
-from sfms_robot.lab.bench.lead import Waves
+from sfms_robot.lab.bench.motion_bench import Waves
 from sfms_robot.runtime.clock import VirtualClock
 
 HEAD = load_head("face28")

@@ -45,14 +45,14 @@ BENCHES: Final[Mapping[str, Bench]] = {
     ),
     "bus": Bench("bus_bench:bus", "write and read of a head, one servo silent, beside the vendor's own calls"),
     "retarget": Bench(
-        "retarget_bench:retarget", "a face to servo ticks, beside a matrix product of the mapping's size"
+        "motion_bench:retarget", "a face to servo ticks, beside a matrix product of the mapping's size"
     ),
-    "lead": Bench("lead:lead", "how late joints are, beside the same with no lead", takes=("head",)),
+    "lead": Bench("motion_bench:lead", "how late joints are, beside the same with no lead", takes=("head",)),
     "listener": Bench(
         "listener_bench:listener", "a frame on every engine, first plan, memory, beside eager fp32 torch"
     ),
     "memory": Bench(
-        "lead:memory", "memory that a run gains per virtual hour, beside what it has", in_all=False,
+        "motion_bench:memory", "memory that a run gains per virtual hour, beside what it has", in_all=False,
         takes=("hours", "head"),
     ),
     "own-voice": Bench(

@@ -21,7 +21,7 @@ goals outside the limits are part of it, not a failure. Virtual time and seeded 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any, Final
@@ -54,27 +54,30 @@ _FAILS_AFTER_S: Final = 1.0  # a bus on which no servo answers; a board gets fiv
 _REPORTED_BY_S: Final = 7.0  # a board that fails is reported
 _OUTSIDE_DEG: Final = 8.0
 
-# Kind -> ids (all of the wire if there are none) and value.
-SPECS: Final[Mapping[str, str]] = {
-    "drop": "drop{two}{when}=0.3",
-    "delay": "delay{two}{when}=0.03",
-    "corrupt": "corrupt{two}{when}=0.3",
-    "duplicate": "duplicate{two}{when}=0.5",
-    "truncate": "truncate{two}{when}=0.3",
-    "echo": "echo{when}",
-    "noise": "noise{when}=0.5",
-    "request-drop": "request-drop{when}=0.3",
-    "request-corrupt": "request-corrupt{when}=0.3",
-    "request-delay": "request-delay{when}=0.03",
-    "silent": "silent{one}{when}",
-    "mute": "mute{one}{when}",
-    "stuck": "stuck{one}{when}",
-    "overload": "overload{one}{when}",
-    "overheat": "overheat{one}{when}",
-    "load": "load{two}{when}=0.1",
-    "voltage": "voltage{when}=20",
-    "brownout": "brownout{when}",
-    "hangup": "hangup{when}",
+# Of each kind, with which it begins: ids (all of the wire if there are none), time and value.
+SPECS: Final = {
+    spec.partition("{")[0]: spec
+    for spec in (
+        "drop{two}{when}=0.3",
+        "delay{two}{when}=0.03",
+        "corrupt{two}{when}=0.3",
+        "duplicate{two}{when}=0.5",
+        "truncate{two}{when}=0.3",
+        "echo{when}",
+        "noise{when}=0.5",
+        "request-drop{when}=0.3",
+        "request-corrupt{when}=0.3",
+        "request-delay{when}=0.03",
+        "silent{one}{when}",
+        "mute{one}{when}",
+        "stuck{one}{when}",
+        "overload{one}{when}",
+        "overheat{one}{when}",
+        "load{two}{when}=0.1",
+        "voltage{when}=20",
+        "brownout{when}",
+        "hangup{when}",
+    )
 }
 CORRUPT: Final = "request-corrupt"
 STORED, MANY_TURNS, OUTSIDE = "stored limits", "many turns", "found outside"

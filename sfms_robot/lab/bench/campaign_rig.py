@@ -36,17 +36,17 @@ class ServoFamily(NamedTuple):
 
     bus: str
     model: str
-    ids: Sequence[int]
-    baud: int
-    checksum: str
+    ids: Sequence[int] = (1, 2, 3, 4)
+    baud: int = 1_000_000
+    checksum: str = "8-bit sum"
 
 
-FAMILIES: Final[Mapping[str, ServoFamily]] = {
-    "dynamixel2": ServoFamily("dynamixel2", "xl330-m288", (1, 2, 3, 4), 1_000_000, "CRC-16"),
-    "dynamixel1": ServoFamily("dynamixel1", "ax-12a", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
-    "dynamixel1-mx": ServoFamily("dynamixel1", "mx-28-1.0", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
-    "sts": ServoFamily("feetech", "sts3215", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
-    "scs": ServoFamily("feetech", "scs0009", (1, 2, 3, 4), 1_000_000, "8-bit sum"),
+FAMILIES: Final = {
+    "dynamixel2": ServoFamily("dynamixel2", "xl330-m288", checksum="CRC-16"),
+    "dynamixel1": ServoFamily("dynamixel1", "ax-12a"),
+    "dynamixel1-mx": ServoFamily("dynamixel1", "mx-28-1.0"),
+    "sts": ServoFamily("feetech", "sts3215"),
+    "scs": ServoFamily("feetech", "scs0009"),
     "maestro": ServoFamily("maestro", "maestro-24", (0, 1, 2, 5), 115_200, ""),
     "maestro-crc": ServoFamily("maestro", "maestro-24", (0, 1, 2, 5), 115_200, "CRC-7"),
     "ssc32": ServoFamily("ssc32", "ssc-32", (0, 1, 2, 5), 115_200, ""),

@@ -16,7 +16,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,13 +26,12 @@ from sfms_robot import config
 from sfms_robot.app.options import RunOptions
 from sfms_robot.app.session import run
 from sfms_robot.data import data_dir
-from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, FaceFrame, SpeakerFrame
 from sfms_robot.lab.bench.measure import HEAD, BenchResult, Row, listener_process, percentiles, row
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.engine import FOLDER, EngineName, has_graphs, read_graphs
 from sfms_robot.listeners.process import threads
-from sfms_robot.listeners.registry import engine_name, load_listener
+from sfms_robot.listeners.registry import engine_name, load_listener, one_thread
 from sfms_robot.ports import Listener
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
@@ -41,10 +40,7 @@ PAPER: Final = "sfms-large"  # ships as a training only
 TRAINED, SEEDED = "trained", "seeded, not trained"
 EAGER: Final = "eager"
 TURN_HOPS: Final = 4
-_TURNS: Final = 20
 _LIMIT_S: Final = 20.0  # for all engines of a listener: a busy machine gives fewer turns
-_MINUTES: Final = 60
-_RUN_S: Final = 8.0
 _COLUMNS: Final = {
     "median": "frame ms", "p99": "p99", "ratio": "of eager", "hearing_ms": "hearing ms", "planning_ms": "planning ms",
     "first_plan_s": "first plan s", "resident_mb": "MB", "distance": "distance",
@@ -52,19 +48,13 @@ _COLUMNS: Final = {
 
 
 def listener() -> BenchResult:
-    """Measure all listeners; restores the number of torch's threads."""
-    import torch
-
-    before = torch.get_num_threads()
+    """Measure all listeners, on one thread each."""
+    one_thread()
     rows: dict[str, Row] = {}
-    torch.set_num_threads(1)
-    try:
-        for name in NAMES:
-            with tempfile.TemporaryDirectory() as scratch:
-                rows |= _measured(name, Path(scratch))
-        rows |= _sfms_paper()
-    finally:
-        torch.set_num_threads(before)
+    for name in NAMES:
+        with tempfile.TemporaryDirectory() as scratch:
+            rows |= _measured(name, Path(scratch))
+    rows |= _sfms_paper()
     return BenchResult(
         BenchResult.of_rows(rows).figures, engine_table(rows), ["a frame is all of a step, on average over a hop"]
     )
@@ -92,7 +82,7 @@ def _measured(name: str, scratch: Path) -> dict[str, Row]:
     rows = {f"{name} {way}": stream.figures(streams[EAGER]) for way, stream in streams.items()}
     for way in streams.keys() - {EAGER}:
         rows[f"{name} {way}"]["distance"] = distance(loaded[way], loaded[EAGER], speaker)
-        rows[f"{name} {way}"] |= asdict(listener_process(*ways[way]))
+        rows[f"{name} {way}"] |= listener_process(*ways[way])
     auto = [*ways][-1]
     how: Any = getattr(loaded[EAGER], "how", loaded[EAGER])  # of a listener that may also decide events
     rows[name] = rows[f"{name} {auto}"] | {
@@ -137,8 +127,7 @@ def _sfms_paper() -> dict[str, Row]:
     from sfms_robot.listeners.torch_engine import torch_engine
 
     training = config.load_training(data_dir("configs") / "training" / f"{PAPER}.yaml")
-    if not isinstance(training, config.Training):
-        raise ConfigError(f"{PAPER}.yaml: listener.kind: expected sfms")
+    assert isinstance(training, config.Training)
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = SfmsModel(training.listener)
@@ -149,7 +138,7 @@ def _sfms_paper() -> dict[str, Row]:
     return {f"{PAPER} {EAGER}": stream.figures(stream) | {"params": params, "weights": SEEDED}}
 
 
-def aged(listener: Listener, memory: Any, speaker: Sequence[SpeakerFrame], minutes: int = _MINUTES) -> Any:
+def aged(listener: Listener, memory: Any, speaker: Sequence[SpeakerFrame], minutes: int = 60) -> Any:
     """Return a memory as after so many minutes, with random whole chunks; a listener without chunks starts fresh."""
     _, memory = listener.step(speaker[0], memory)
     how = getattr(memory, "how", memory)
@@ -187,7 +176,7 @@ def talk(frames: int = 100) -> list[SpeakerFrame]:
     return out
 
 
-def in_run(folder: Path, duration_s: float = _RUN_S) -> dict[str, Any]:
+def in_run(folder: Path, duration_s: float = 8.0) -> dict[str, Any]:
     """Drive `HEAD` on emulated servos with the listener in `folder`, which hears both tracks, in real time.
 
     The loop must not be late because of the listener, and a step must not take longer than the 40 ms of a frame.
@@ -255,7 +244,7 @@ class Stream:
         }
 
 
-def take_turns(streams: Mapping[str, Stream], speaker: Sequence[SpeakerFrame], turns: int = _TURNS) -> None:
+def take_turns(streams: Mapping[str, Stream], speaker: Sequence[SpeakerFrame], turns: int = 20) -> None:
     """Let all streams hear the same person, `TURN_HOPS` plans at a time; ends early after `_LIMIT_S`."""
     frames = {name: TURN_HOPS * stream.listener.hop for name, stream in streams.items()}
     for name, stream in streams.items():

@@ -22,6 +22,7 @@ import numpy as np
 from sfms_robot.errors import BusError, ConfigError, ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
+from sfms_robot.ports import Observer, Tick
 from sfms_robot.processes import cores
 
 HEAD: Final = "face28"
@@ -195,26 +196,31 @@ def children_of(pid: int) -> list[int]:
     return found
 
 
+class ResidentMemory(Observer):
+    """An observer of the resident memory of this process, sampled every `every_s` of loop time."""
+
+    def __init__(self, every_s: float) -> None:
+        self._every_s = every_s
+        self.times_s: list[float] = []
+        self.resident_mb: list[float] = []
+
+    def tick(self, seen: Tick) -> None:
+        if seen.time_s >= len(self.times_s) * self._every_s:
+            self.times_s.append(seen.time_s)
+            self.resident_mb.append(memory_mb("VmRSS"))
+
+
 # --- a listener in a process ----------------------------------------------------------------------------------------
 
-_LISTENER_STARTS: Final = 3
 _HEARD_FRAMES: Final = 50
 _LISTENER_CHILD: Final = f"from {__name__} import listen_to_silence; listen_to_silence()"
 
 
-@dataclass(frozen=True)
-class ProcessFigures:
-    """Medians over some starts: time to the first plan, resident memory while listening, and its peak."""
-
-    first_plan_s: float
-    resident_mb: float
-    peak_mb: float
-
-
-def listener_process(folder: Path, engine: EngineName, repeats: int = _LISTENER_STARTS) -> ProcessFigures:
+def listener_process(folder: Path, engine: EngineName, repeats: int = 3) -> dict[str, float]:
     """Start a process with one listener `repeats` times. Blocks for a second or two each.
 
-    Raises ModelError if the process ends early.
+    Returns medians: time to the first plan, resident memory while listening, and its peak. Raises ModelError if the
+    process ends early.
     """
     found = []
     for _ in range(repeats):
@@ -228,7 +234,7 @@ def listener_process(folder: Path, engine: EngineName, repeats: int = _LISTENER_
         if process.returncode or not planned:
             raise ModelError(f"{folder}: a listener process on {engine} ended with exit code {process.returncode}")
         found.append((first_plan_s, *json.loads(last)))
-    return ProcessFigures(*np.median(found, axis=0).tolist())
+    return dict(zip(("first_plan_s", "resident_mb", "peak_mb"), np.median(found, axis=0).tolist(), strict=True))
 
 
 def listen_to_silence() -> None:

@@ -1,4 +1,6 @@
-"""Two benches of a run in virtual time with synthetic plans: the delay of each joint, and memory over hours.
+"""Benches of motion: CPU time from a face to servo ticks, and two of a run in virtual time with synthetic plans.
+
+`retarget`: the parts of a tick, on recorded faces, without servos.
 
 `lead`: every channel of a synthetic listener swings at its own frequencies, and its plans come as those of the shipped
 listener. The delay of a joint is where the cross-correlation of its intended and its emulated angle peaks, interpolated
@@ -10,8 +12,9 @@ between two ticks by a parabola. It includes everything: timeline, limiter, bus,
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -19,40 +22,31 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.open_head import open_head
+from sfms_robot.app.open_head import build_motion, open_head
 from sfms_robot.app.options import HeadOptions, RunOptions
 from sfms_robot.app.session import drive_head, run, run_parts
 from sfms_robot.app.wiring import calibration_of
-from sfms_robot.config import Head
+from sfms_robot.config import Head, load_head
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, Bools, Doubles, Floats, Plan, SpeakerFrame
-from sfms_robot.lab.bench.live_stamps import ResidentMemory
-from sfms_robot.lab.bench.measure import HEAD, Row, row
+from sfms_robot.lab.bench.measure import HEAD, ResidentMemory, Row, row, times
+from sfms_robot.motion.limits import difference
 from sfms_robot.ports import Clock, Observer, Tick
 from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.safety import Interrupt
 
 _HORIZON, _HOP = 8, 4  # frames of a plan, and between two plans
 _LATENCY_S: Final = 0.010  # from the last frame heard to the plan
-_DURATION_S: Final = 8.0
 _SETTLED_S: Final = 1.5  # by then the head has eased in
 _FARTHEST_S: Final = 0.4  # largest delay that is looked for, in both directions
 _WAVES: Final = 3  # sines of a channel
 _RANGE_HZ: Final = (0.3, 1.3)
 _MOVED_RAD: Final = math.radians(0.5)  # the delay of a joint that moves less is not measured
-_MEMORY_HEAD: Final = "interbotix_wxxms"  # two servos: hours pass quickly
 _HOUR_S: Final = 3600.0
 _LOOKS: Final = 20  # at memory, per hour
-
-
-@dataclass(frozen=True)
-class Delays:
-    """Delay of each joint [s], positive when late; NaN for a joint that hardly moves."""
-
-    joints: Sequence[str]
-    led_s: Doubles
-    unled_s: Doubles
+_RETARGET_HZ: Final = 100.0
+_RETARGET_TICKS: Final = 2000
 
 
 class Waves:
@@ -114,18 +108,21 @@ class _Shafts(Observer):
 
 def lead(head: str = HEAD) -> dict[str, Row]:
     """Return rows of the delay of each joint with lead [ms]; the peer is the delay without."""
-    found = delays(head)
-    moved = np.isfinite(found.led_s)
-    led, unled = (np.abs(each[moved]) * 1e3 for each in (found.led_s, found.unled_s))
-    names = [name for name, there in zip(found.joints, moved, strict=True) if there]
+    joints, *both_s = delays(head)
+    moved = np.isfinite(both_s[0])
+    led, unled = (np.abs(each[moved]) * 1e3 for each in both_s)
+    names = [name for name, there in zip(joints, moved, strict=True) if there]
     rows = {f"lead.{name}": row([a], [b], "ms", "no lead") for name, a, b in zip(names, led, unled, strict=True)}
     return {"lead": row(led.tolist(), unled.tolist(), "ms", f"no lead ({head})"), **rows}
 
 
-def delays(head: str, duration_s: float = _DURATION_S) -> Delays:
-    """Measure a head with the leads of its file, and without lead."""
+def delays(head: str, duration_s: float = 8.0) -> tuple[Sequence[str], Doubles, Doubles]:
+    """Return joints, and their delays [s] with the leads of the head's file and without lead.
+
+    Delays are positive when late; NaN for a joint that hardly moves.
+    """
     (joints, led_s), (_, unled_s) = (_delays(head, share, duration_s) for share in (1.0, 0.0))
-    return Delays(joints, led_s, unled_s)
+    return joints, led_s, unled_s
 
 
 def _delays(name: str, share: float, duration_s: float) -> tuple[Sequence[str], Doubles]:
@@ -174,10 +171,11 @@ def delay_ticks(meant: Doubles, seen: Doubles, farthest: int) -> Doubles:
     return np.where(moved, best - farthest + between, np.nan)
 
 
-def memory(hours: float = 4.0, head: str = _MEMORY_HEAD) -> dict[str, Row]:
+def memory(hours: float = 4.0, head: str = "interbotix_wxxms") -> dict[str, Row]:
     """Return the growth of resident memory after the first hour [MB], beside the memory then; Linux only.
 
-    `head`: a name or a folder. Raises BusError if the run ends early.
+    `head`: a name or a folder; the usual one has two servos, so that hours pass quickly. Raises BusError if the run
+    ends early.
     """
     looks = ResidentMemory(_HOUR_S / _LOOKS)
     with TemporaryDirectory() as folder:
@@ -188,3 +186,54 @@ def memory(hours: float = 4.0, head: str = _MEMORY_HEAD) -> dict[str, Row]:
     first_s = min(1.0, hours / 2) * _HOUR_S
     settled = [mb for at_s, mb in zip(looks.times_s, looks.resident_mb, strict=True) if first_s <= at_s]
     return {"memory.growth": row([settled[-1] - settled[0]], [settled[0]], "MB", "resident after the first hour")}
+
+
+def retarget() -> dict[str, Row]:
+    """Return rows of CPU time: `retarget.tick` = mapping + limits + calibration, each of these, and the timeline."""
+    head = load_head(HEAD)
+    motion = build_motion(head, _RETARGET_HZ)
+    calibration = calibration_of(head.joints)
+    plans = _recorded_plans()
+    timeline, limiter = motion.timeline.start(), motion.limiter.start(motion.rest_rad)
+    before = here = motion.rest_rad
+    memory = motion.retargeter.start()
+    spent: dict[str, list[float]] = {"timeline": [], "mapping": [], "limits": [], "calibration": []}
+    for tick in range(_RETARGET_TICKS):
+        now_s = tick / _RETARGET_HZ
+        marks = [time.thread_time()]
+        if now_s >= plans[0].made_at_s:
+            timeline = motion.timeline.accept(plans.pop(0), timeline)
+        asked_s = np.concatenate([[now_s], now_s + motion.leads_s + 1 / _RETARGET_HZ])
+        faces, timeline = motion.timeline.sample(asked_s, now_s, timeline)
+        marks.append(time.thread_time())
+        ahead, memory = motion.retargeter.step(faces[1:], memory)
+        marks.append(time.thread_time())
+        goals, limiter = motion.limiter.step(difference(before, here, ahead, 1 / _RETARGET_HZ), limiter)
+        marks.append(time.thread_time())
+        calibration.to_ticks(goals)
+        marks.append(time.thread_time())
+        before, here = here, ahead
+        for name, took_s in zip(spent, np.diff(marks), strict=True):
+            spent[name].append(1e3 * float(took_s))
+    safe = np.sum([spent["mapping"], spent["limits"], spent["calibration"]], axis=0).tolist()
+    rng = np.random.default_rng(0)
+    matrix, frame = rng.normal(size=(len(head.joints), MOTION_DIM)), rng.normal(size=MOTION_DIM)
+    peers = times(lambda: matrix @ frame, _RETARGET_TICKS, time.thread_time)
+    name = f"{len(head.joints)} x {MOTION_DIM} matrix product"
+    rows = {f"retarget.{part}": row(took, peers, "ms", name) for part, took in spent.items()}
+    return {"retarget.tick": row(safe, peers, "ms", name), **rows}
+
+
+def _recorded_plans() -> list[Plan]:
+    """Return recorded faces as plans of 8 frames, a new one every 4, from 0 s to past the last tick."""
+    from sfms_robot.app.head.head_check import named_faces  # loads scipy, whose memory is not that of a run
+
+    need = int(_RETARGET_TICKS / _RETARGET_HZ / FRAME_S) + 2 * _HORIZON
+    clips: list[Floats] = []
+    while sum(map(len, clips)) < need:
+        clips += [clip for _, clip in named_faces() if len(clip) > _HORIZON]
+    faces = np.concatenate(clips)
+    return [
+        Plan(k * FRAME_S, FRAME_S * np.arange(k + 1.0, k + _HORIZON + 1), faces[k : k + _HORIZON])
+        for k in range(0, need - _HORIZON, _HOP)
+    ]

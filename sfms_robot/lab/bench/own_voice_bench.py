@@ -8,7 +8,7 @@ float64 at 16 kHz. Levels are root mean squares over the frames with speech.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -29,7 +29,7 @@ from sfms_robot.signals.own_voice_gate import WINDOW, OwnVoiceGate, SpeechProbab
 CHOSEN_ON: Final = ("hvb_01cefd6f5c044a6f", "hvb_02e41649e7c441fd", "hvb_03a17cc36d474151")
 _NEAR_FRAMES: Final = 3  # 100 ms, in whole frames
 # Size in metres and the time in which sound decays by 60 dB.
-_ROOMS: Final[Mapping[str, tuple[tuple[float, float, float], float]]] = {
+_ROOMS: Final = {
     "small": ((3.2, 2.8, 2.5), 0.25),
     "office": ((5.0, 4.0, 2.8), 0.4),
     "hall": ((8.0, 6.0, 3.2), 0.6),
@@ -236,16 +236,13 @@ class HeardScene:
             late = np.concatenate([np.zeros(_LOUDSPEAKER_DELAY), own])[: len(own)]
             mic += _at_level(late, own_echo, self.own_speaks, condition.own_db)
         if condition.motors_db is not None:
-            self.speed_rad_s = _joint_speeds(n)
+            file = data_dir("sim") / "conversations" / "joint_speeds.npz"  # as commanded to a listening head
+            speed = np.load(file)["speed_rad_s"].astype(np.float64)
+            to_and_fro = np.concatenate([speed, speed[::-1]])
+            self.speed_rad_s = np.resize(to_and_fro, (n, speed.shape[1]))
             total = self.speed_rad_s.sum(axis=1)
             mic += _at_level(gear_noise(self.speed_rad_s), motor_echo, total > 0.2 * total.mean(), condition.motors_db)
         self.mic, self.reference = mic.astype(np.float32), own.astype(np.float32)
-
-
-def _joint_speeds(n: int) -> Doubles:
-    """Return (n, 28) speeds [rad/s] commanded to a listening head, forward and backward in time in turn."""
-    speed = np.load(data_dir("sim") / "conversations" / "joint_speeds.npz")["speed_rad_s"].astype(np.float64)
-    return np.resize(np.concatenate([speed, speed[::-1]]), (n, speed.shape[1]))
 
 
 def gear_noise(speed_rad_s: Doubles) -> Doubles:

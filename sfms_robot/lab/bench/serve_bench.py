@@ -27,7 +27,6 @@ import numpy as np
 
 from sfms_robot.app.serve.batch_process import Served
 from sfms_robot.app.serve.service import WorkerPool
-from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
 from sfms_robot.lab.bench.listener_bench import NAMES, with_weights
 from sfms_robot.lab.bench.measure import BenchResult, Say, machine
@@ -45,9 +44,8 @@ from sfms_robot.listeners.remote_messages import (
 )
 from sfms_robot.listeners.stream_server import DEADLINE_S
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.sources.registry import voice_file
+from sfms_robot.sources.registry import shipped_speaker
 
-_SPEAKER: Final = "katie"
 _WARM_S: Final = 1.0
 _SECONDS: Final = 4.0
 _MOST: Final = 512
@@ -258,9 +256,6 @@ def _join(pool: WorkerPool, index: int) -> str:
 
 def _frames() -> list[bytes]:
     """Return every frame of the recording as a message with number 0."""
-    file = voice_file(_SPEAKER)
-    if file is None:
-        raise ConfigError(f"bench serve: speaker {_SPEAKER!r} is not among the shipped ones")
-    audio = read_audio(file)
+    audio = read_audio(shipped_speaker("katie").audio)
     chunks = audio[: len(audio) // FRAME_SAMPLES * FRAME_SAMPLES].reshape(-1, FRAME_SAMPLES)
     return [frame_message(SentFrame(0, SpeakerFrame(FRAME_S, chunk), 0.0)) for chunk in chunks]

@@ -46,7 +46,7 @@ def startup(against: Path | None = None) -> dict[str, Row]:
             ours.append(_duration_s([*MAIN, *words], None))
             theirs.append(_duration_s(["-c", "pass"] if other is None else [*MAIN, *words], other))
         rows[f"startup.{name}"] = row(ours, theirs, "s", peer)
-    runs = [(_run(None), {} if other is None else _run(other)) for _ in range(_REPEATS)]
+    runs = [(start_and_end(None), {} if other is None else start_and_end(other)) for _ in range(_REPEATS)]
     bare = {"s": _duration_s(["-c", "pass"], None), "MB": _bare_mb()}
     for key, unit in {"first_goal": "s", "exit": "s", "resident": "MB"}.items():
         theirs = [its.get(key, bare[unit]) for _, its in runs]
@@ -67,14 +67,13 @@ def _bare_mb() -> float:
     return int(done.stdout) / 1024
 
 
-def first_goal_s(words: Sequence[str], env: Mapping[str, str] | None = None) -> float | None:
-    """Return the time from typing `run` with these words to its first goal on the wire; None without one. Blocks."""
-    seen_s = _run(env, words)["first_goal"]
-    return None if np.isnan(seen_s) else seen_s
+def start_and_end(
+    env: Mapping[str, str] | None, more: Sequence[str] = ("--audio", DEFAULT_SPEAKER)
+) -> dict[str, float]:
+    """Listen for one second on emulated servos, in real time; return `first_goal`, `exit` and `resident`.
 
-
-def _run(env: Mapping[str, str] | None, more: Sequence[str] = ("--audio", DEFAULT_SPEAKER)) -> dict[str, float]:
-    """Listen for one second on emulated servos, in real time; return `first_goal`, `exit` and `resident`."""
+    `more`: words of `run`. `first_goal` is NaN without one.
+    """
     head = load_head(HEAD)
     with launch(emulated(head)["main"]) as chain:
         words = ["run", "--head", HEAD, "--port", chain.device, "--duration", str(_RUN_S), "--seed", "1", "--json"]

@@ -19,11 +19,10 @@ import os
 import random
 import signal
 import subprocess
-import sys
 import time
 import urllib.request
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -48,11 +47,11 @@ from sfms_robot.lab.bench.live_bench import (
     load,
     patient_head,
 )
-from sfms_robot.lab.bench.live_stamps import listener_of
-from sfms_robot.lab.bench.measure import HEAD, LISTENER, MAIN, BenchResult, Say, package_environment
+from sfms_robot.lab.bench.measure import HEAD, LISTENER, MAIN, BenchResult, Say, children_of, package_environment
+from sfms_robot.lab.bench.throttle_bench import held
 
 KINDS: Final = ("killed", "stopped", "cut", "unplugged")
-LONGEST_S: Final[Mapping[str, float]] = {"killed": 1.0, "stopped": 1.0, "cut": 1.0, "unplugged": 1.5}
+LONGEST_S: Final = {"killed": 1.0, "stopped": 1.0, "cut": 1.0, "unplugged": 1.5}
 _MINUTES: Final = 30.0
 _EACH: Final = 20  # of a kind, in half an hour
 _LOOK_S: Final = 0.1  # between two looks at the status: a state may be seen that much late
@@ -174,6 +173,15 @@ class _Victim:
         return None
 
 
+def listener_of(pid: int) -> int:
+    """Return the id of the listener's process of a run. Raises BusError if there is none."""
+    for child in children_of(pid):
+        with suppress(OSError):
+            if "listeners.process" in Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8"):
+                return child
+    raise BusError("bench live: the run has no listener's process")
+
+
 def _status(port: int) -> dict[str, Any]:
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=5) as answer:
         document: dict[str, Any] = json.load(answer)
@@ -280,18 +288,14 @@ def _running(
         "--listener", LISTENER, "--audio", audio,
         "--face", person.face, "--record", str(folder / "run"), "--status", str(port), "--json", "--yes",
     ]  # fmt: skip
-    with (folder / "out").open("wb") as out, (folder / "said").open("wb") as err:
-        process = subprocess.Popen(
-            [sys.executable, *MAIN, *words], stdout=out, stderr=err, stdin=subprocess.DEVNULL,
-            env={**package_environment(), **person.environment},
-        )  # fmt: skip
-        try:
-            _wait_listening(process, port, folder / "said")
-            yield process, port
-        finally:
-            if process.poll() is None:
-                process.kill()
-            process.wait()
+    environment = {**package_environment(), **person.environment}
+    with (
+        (folder / "out").open("wb") as out,
+        (folder / "said").open("wb") as said,
+        held([*MAIN, *words], None, stdin=subprocess.DEVNULL, stdout=out, stderr=said, env=environment) as process,
+    ):
+        _wait_listening(process, port, folder / "said")
+        yield process, port
 
 
 def _wait_listening(process: subprocess.Popen[bytes], port: int, said: Path) -> None:

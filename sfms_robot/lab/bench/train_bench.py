@@ -21,23 +21,20 @@ from sfms_robot.lab.bench.measure import BenchResult, Row, Say, row
 from sfms_robot.lab.learning.dry_run import jobs_of
 from sfms_robot.lab.learning.job import Job, ProcessGroup
 from sfms_robot.lab.learning.training_loop import Gradients, make_step
+from sfms_robot.listeners.registry import one_thread
 
 FILES: Final = ("arig", "sfms-small")
-STEPS: Final = 12  # measured, after one that is not
 MOST_BESIDE: Final = {"arig": 0.15}  # share of a step, by job
 
 
-def measure(say: Say, steps: int = STEPS) -> BenchResult:
-    """Measure every job of the shipped files. Blocks for half a minute."""
-    threads, rows = torch.get_num_threads(), dict[str, Row]()
-    torch.set_num_threads(1)
-    try:
-        for file in FILES:
-            for job in jobs_of(load_training(data_dir("configs") / "training" / f"{file}.yaml")):
-                row = rows[f"train.{job.name}"] = _measured(job, steps)
-                say(f"{job.name}: {row['ratio']:.1%} of a step is not the model")
-    finally:
-        torch.set_num_threads(threads)
+def measure(say: Say, steps: int = 12) -> BenchResult:
+    """Measure `steps` of every job of the shipped files, after one that is not measured. Blocks for half a minute."""
+    rows = dict[str, Row]()
+    one_thread()
+    for file in FILES:
+        for job in jobs_of(load_training(data_dir("configs") / "training" / f"{file}.yaml")):
+            row = rows[f"train.{job.name}"] = _measured(job, steps)
+            say(f"{job.name}: {row['ratio']:.1%} of a step is not the model")
     missed = [name for name, most in MOST_BESIDE.items() if rows[f"train.{name}"]["ratio"] > most]
     lines = [f"{name}: more than {MOST_BESIDE[name]:.0%} of a step is not the model" for name in missed]
     return BenchResult.of_rows(rows, lines, passed=not missed)

@@ -5,8 +5,7 @@ import pytest
 from virtual_time import Time
 
 from sfms_robot.frames import FRAME_S, FaceFrame, Plan, SpeakerFrame
-from sfms_robot.lab.bench.live_bench import GOALS, goals
-from sfms_robot.lab.bench.live_stamps import SETTLED_S, STAGES, Stamps
+from sfms_robot.lab.bench.live_bench import GOALS, SETTLED_S, STAGES, Stamps, goals
 from sfms_robot.lab.bench.torture_bench import Blow, missed_ticks
 from sfms_robot.ports import Tick
 
@@ -17,7 +16,7 @@ SOUND = np.zeros(640, np.float32)
 def stamped(seconds, hop, source_s, plan_s, write_s=0.0, skip=()):
     """A run in made-up time: frames come `source_s` late, plans `plan_s` after the frame that they are made of."""
     time = Time()
-    stamps = Stamps(time.now_s, lambda: source_s / 2, 1 / TICK_S)
+    stamps = Stamps(lambda: source_s / 2, 1 / TICK_S, time.now_s)
     given, plans = 0, []
     for tick in range(round(seconds / TICK_S)):
         if tick in skip:
