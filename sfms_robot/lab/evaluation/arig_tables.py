@@ -47,7 +47,6 @@ CLIP_FRAMES: Final = 250
 PARTS: Final = {"exp": SHAPES, "pose": POSE}
 _CLUSTERS: Final = {"exp": 40, "pose": 20}  # DIM's; the paper names none
 _NAMES: Final = tuple(f"{column} {part}" for column in ("FD", "RPCC", "SID", "Var") for part in PARTS)
-
 _LEAST_ALIKE: Final = 0.5  # variance of faces that can be compared, over people's; at most its inverse
 
 
@@ -99,7 +98,7 @@ def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str
             metrics.shannon_index(ours, centres[part], "bits"),
             metrics.variance(ours),
         ))  # fmt: skip
-    return dict(zip(_NAMES, np.ravel(found, order="F").tolist(), strict=True))
+    return dict(zip(_NAMES, np.transpose(found).ravel().tolist(), strict=True))
 
 
 def rows_of(

@@ -6,7 +6,7 @@ motion composed from known nods. The same count shows whether a listener perform
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -34,7 +34,6 @@ _SIZES: Final[Mapping[str, tuple[float, ...]]] = {  # edges of the ranges of siz
     "smile": (0.0, 0.2, 0.3, 0.45, 0.6, 1.01),
 }
 _EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])  # an eye's yaw and pitch for a channel of 1
-_EYES: Final = list(EYE_CHANNELS)
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def _pitch(motion: Floats) -> Doubles:
     tracked: then nothing is removed.
     """
     pitch = motion[:, CHANNEL_INDEX["pitch"]].astype(float)
-    return pitch - head_part(gaze_rad(motion))[:, 1] if motion[:, _EYES].any() else pitch
+    return pitch - head_part(gaze_rad(motion))[:, 1] if motion[:, list(EYE_CHANNELS)].any() else pitch
 
 
 def gaze_rad(motion: Floats) -> Doubles:
@@ -266,7 +265,7 @@ _SHIFT_RAD: Final = np.deg2rad(5.0)
 _SWAY_WINDOW: Final = 20 * FRAME_HZ
 _CYCLE: Final = 0.25  # of the depth of a nod: less between two peaks does not part them
 _SLOW: Final = 10 * FRAME_HZ  # frames whose median is a slow pose
-FindEvents = Callable[[Floats, float], Sequence[events.Event]]
+_LEFT: Final = {"blink": "eyeBlinkLeft", "smile": "mouthSmileLeft"}
 
 
 def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, float]:
@@ -297,8 +296,8 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
         "nods": onsets / listened if listened else np.nan,
         "nod_deg": middle(np.degrees(sizes)),
         "phrase_end_ratio": phrase_timing.ratio_of(counts.tolist()),
-        "blinks": len(_lasted_s(motions, "eyeBlinkLeft", events.find_blinks)) / minutes,
-        "smiles": len(_lasted_s(motions, "mouthSmileLeft", events.find_smiles)) / minutes,
+        "blinks": len(_lasted_s(motions, "blink")) / minutes,
+        "smiles": len(_lasted_s(motions, "smile")) / minutes,
         "still_share": float(np.mean(still)) if still else np.nan,
         "speed_deg_s": _fastest(motions, 1),
         "acceleration_deg_s2": _fastest(motions, 2),
@@ -311,10 +310,10 @@ def middle(values: Sequence[float] | Doubles) -> float:
     return float(np.median(values)) if len(values) else np.nan
 
 
-def _lasted_s(motions: Sequence[Floats], channel: str, find: FindEvents) -> list[float]:
-    """Return how long each event lasts that is found in a channel."""
-    every = (event for motion in motions for event in find(motion[:, CHANNEL_INDEX[channel]], FRAME_HZ))
-    return [end - start for start, end, _ in every]
+def _lasted_s(motions: Sequence[Floats], kind: str) -> list[float]:
+    """Return how long each event of a kind lasts, as the left side of the face shows it."""
+    find, channel = MOTION_EVENTS[kind].find, CHANNEL_INDEX[_LEFT[kind]]
+    return [end - start for motion in motions for start, end, _ in find(motion[:, channel], FRAME_HZ)]
 
 
 def _fastest(motions: Sequence[Floats], order: int) -> float:
@@ -344,8 +343,8 @@ def movement(motions: Sequence[Floats], addressed: Sequence[Bools]) -> dict[str,
         "nod_s": middle(lengths),
         "nod_cycle_s": middle(cycles),
         "nod_swings": middle(swings),
-        "blink_s": middle(_lasted_s(motions, "eyeBlinkLeft", events.find_blinks)),
-        "smile_s": middle(_lasted_s(motions, "mouthSmileLeft", events.find_smiles)),
+        "blink_s": middle(_lasted_s(motions, "blink")),
+        "smile_s": middle(_lasted_s(motions, "smile")),
         "look_s": middle([length_s for gaze in gazes for length_s in looks_s(gaze)]),
         "gaze_on_person": float(on_person.mean()) if len(on_person) else np.nan,
         "gaze_shifts_per_minute": sum(map(shifts, gazes)) / minutes if minutes else np.nan,

@@ -204,14 +204,13 @@ def _table_2(clips: Clips, pred: Doubles) -> Score:
 
     def score(chosen: Chosen) -> dict[str, Any]:
         correlation, distance, diverse, varied = by_clip[chosen].mean(axis=0).tolist()
-        known = lags[chosen][np.isfinite(lags[chosen])]
         return {
             "FRCorr": correlation * pred.shape[1],
             "FRDist": distance,
             "FRDiv": diverse,
             "FRVar": varied,
             "FRDvs": metrics.frdvs(pred[chosen]),
-            "FRSyn": float(known.mean()) if len(known) else float("nan"),
+            "FRSyn": metrics.mean_known(lags[chosen]),
             "FRCorr per sample": correlation,
         }
 

@@ -23,7 +23,7 @@ from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, find_laughter, find_voices, split_voices
 from sfms_robot.lab.evaluation import timing
 from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, Sightings, added_up, asked_and_seen
-from sfms_robot.lab.evaluation.intervals import LEVEL, Estimate, Sums, estimates
+from sfms_robot.lab.evaluation.intervals import LEVEL, Estimate, Sums, estimates, rounded
 from sfms_robot.lab.evaluation.listener_meetings import (
     SHIFT_S,
     ListenerMeeting,
@@ -130,7 +130,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
         "seeds": options.seeds,
         "hop": None if isinstance(listener, EventModel) else listener.hop,
         "engine": None if isinstance(listener, EventModel) else engine_name(listener),
-        **{name: one.value if one.value is None else round(one.value, 4) for name, one in found.items()},
+        **{name: rounded(one.value) for name, one in found.items()},
         "people_smiles_per_minute": None,
         "people_blinks_per_minute": None,
         "interval": {name: one.interval and [round(end, 4) for end in one.interval] for name, one in found.items()},

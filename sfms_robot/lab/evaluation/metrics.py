@@ -30,7 +30,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Floats
 
 # Of the tables of the SFMS paper: parts of a face by motion space, clusters of the Shannon index (V-D1).
-PARTS: Final[Mapping[str, Mapping[str, slice]]] = {
+PARTS: Final = {
     "arkit58": {"expression": slice(6, 58), "rotation": slice(0, 3)},
     "faceverse58": {"expression": slice(0, 52), "rotation": slice(52, 55)},
     "deca56": {"expression": slice(0, 50), "rotation": slice(50, 53)},
@@ -120,29 +120,24 @@ def shannon_index(pred: Doubles, centres: Doubles, unit: Literal["nats", "bits"]
 def cluster_centres(reference: Doubles, k: int) -> Doubles:
     """Return the k-means centres (k, D) of the pooled frames of clips, with a fixed seed.
 
-    Raises ValueError for fewer frames than k, or too many equal frames.
+    Raises ConfigError for fewer frames than k, or too many equal frames.
     """
     frames = reference.reshape(-1, reference.shape[-1])
     if len(frames) < k:
-        raise ValueError(f"{len(frames)} frames do not make {k} clusters")
+        raise ConfigError(f"the clips' own motion: {len(frames)} frames do not make {k} clusters")
     with warnings.catch_warnings(), np.errstate(invalid="raise"):
         warnings.simplefilter("ignore", UserWarning)  # an empty cluster counts 0 in the entropy
         try:
             found, _ = kmeans2(frames, k, iter=_KMEANS_ROUNDS, minit="++", seed=np.random.default_rng(0))
         except FloatingPointError:
-            raise ValueError(f"{len(frames)} frames differ too little to make {k} clusters") from None
+            problem = f"{len(frames)} frames differ too little to make {k} clusters"
+            raise ConfigError(f"the clips' own motion: {problem}") from None
     return np.asarray(found, np.float64)
 
 
 def centres_of(truth: Doubles, parts: Mapping[str, slice], clusters: Mapping[str, int]) -> Mapping[str, Doubles]:
-    """Return the clusters of the truth (M, T, D) for each part of a face, the same for every row of a table.
-
-    Raises ConfigError for clips that are too similar.
-    """
-    try:
-        return {part: cluster_centres(truth[..., where], clusters[part]) for part, where in parts.items()}
-    except ValueError as error:
-        raise ConfigError(f"the clips' own motion: {error}") from error
+    """Return the clusters of the truth (M, T, D) for each part of a face, the same for every row of a table."""
+    return {part: cluster_centres(truth[..., where], clusters[part]) for part, where in parts.items()}
 
 
 def rpcc_flat(target: Doubles, pred: Doubles, speaker: Doubles) -> float:
@@ -255,9 +250,13 @@ def frvar(pred: Doubles) -> float:
 
 def frsyn(pred: Doubles, speaker: Doubles, as_challenge: bool = True) -> float:
     """Return FRSyn: the mean of the finite `synchrony_lags`; NaN without any."""
-    known = synchrony_lags(pred, speaker, as_challenge)
-    known = known[np.isfinite(known)]
-    return float(np.mean(known)) if len(known) else float("nan")
+    return mean_known(synchrony_lags(pred, speaker, as_challenge))
+
+
+def mean_known(values: Doubles) -> float:
+    """Return the mean of the finite values; NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else float("nan")
 
 
 def synchrony_lags(pred: Doubles, speaker: Doubles, as_challenge: bool) -> Doubles:

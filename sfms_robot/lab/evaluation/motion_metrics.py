@@ -175,7 +175,7 @@ def _part_rows(scored: _Scored, part: str, where: slice, seed: int) -> Iterator[
         "STS: of the clips end to end": partial(metrics.sts, truth),
     }
     if truth.shape[0] * truth.shape[1] >= CLUSTERS[part]:
-        centres = metrics.centres_of(truth, {part: slice(None)}, CLUSTERS)[part]
+        centres = metrics.cluster_centres(truth, CLUSTERS[part])
         pooled["SI: nats"] = partial(metrics.shannon_index, centres=centres)
     for name, score in by_clip.items():
         yield _over_clips(

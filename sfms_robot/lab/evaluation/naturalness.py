@@ -13,7 +13,6 @@ training loss.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -36,7 +35,7 @@ from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import detect, open_for, split_names
 from sfms_robot.lab.corpora.reading import speaks
 from sfms_robot.lab.evaluation.detection import middle, movement, nods_of, slow_poses_deg
-from sfms_robot.lab.evaluation.intervals import Chosen, bootstrap, intervals, people_of
+from sfms_robot.lab.evaluation.intervals import Chosen, bootstrap, intervals, people_of, rounded
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread
 from sfms_robot.listeners.engine import EngineName
@@ -152,7 +151,7 @@ def long_run(listener: Listener, heard: Sequence[Sequence[SpeakerFrame]], drift_
 def compared(ours: Mapping[str, float], theirs: Mapping[str, float]) -> dict[str, Any]:
     """Return the figures of `movement` of both; None where there is no data."""
     figures = {**ours, **{f"people_{name}": value for name, value in theirs.items()}}
-    return {name: round(value, 3) if math.isfinite(value) else None for name, value in figures.items()}
+    return {name: rounded(value, 3) for name, value in figures.items()}
 
 
 def nod_ratios(ours: Sequence[Doubles], theirs: Sequence[Doubles], chosen: Chosen) -> dict[str, float]:
@@ -194,16 +193,11 @@ def two_samples(ours: Sequence[Floats], theirs: Sequence[Floats], training: Sequ
     pairs |= {
         f"levelled_{name}": ([*map(levelled, one)], [*map(levelled, other)]) for name, (one, other) in pairs.items()
     }
-    found = {name: dict[str, tuple[float, float, float]]() for name in pairs}
+    found, interval = ({name: dict[str, Any]() for name in pairs} for _ in range(2))
     for name, region in tracked(list(product(pairs, REGIONS)), "two-sample tests"):
-        found[name][region] = separability(*pairs[name], region)
-    return {
-        **{name: {region: round(auc, 3) for region, (auc, _, _) in one.items()} for name, one in found.items()},
-        "interval": {
-            name: {region: [round(low, 3), round(high, 3)] for region, (_, low, high) in one.items()}
-            for name, one in found.items()
-        },
-    }
+        auc, *ends = separability(*pairs[name], region)
+        found[name][region], interval[name][region] = round(auc, 3), [round(end, 3) for end in ends]
+    return {**found, "interval": interval}
 
 
 def windows(motion: Floats, rng: np.random.Generator, judged: Bools | None = None) -> Floats:

@@ -62,7 +62,7 @@ _STEPS: Final = 200
 class Trial:
     """Two conditions side by side, and the number of the voice that both hear."""
 
-    number: int
+    trial: int
     voice: int
     left: str
     right: str
@@ -111,11 +111,11 @@ class Study:
         """Return the participant's next trial, clips without their conditions' names; or that all is answered."""
         shown = self._trials(participant)
         done = {answer.trial for answer in self._answers if answer.participant == participant}
-        left = [trial for trial in shown if trial.number not in done]
+        left = [trial for trial in shown if trial.trial not in done]
         found: dict[str, Any] = {"answered": len(shown) - len(left), "trials": len(shown)}
         if left:
             trial = left[0]
-            found |= {"trial": trial.number, "audio": f"voice-{trial.voice}.wav"}
+            found |= {"trial": trial.trial, "audio": f"voice-{trial.voice}.wav"}
             for side, condition in (("left", trial.left), ("right", trial.right)):
                 found[side] = f"{clip_name(self._seed, condition, trial.voice)}.f32"
         return found
@@ -126,7 +126,7 @@ class Study:
         Raises ConfigError for an invalid answer, or if it cannot be written.
         """
         shown = self._trials(participant)
-        trial = next((trial for trial in shown if trial.number == number), None)
+        trial = next((trial for trial in shown if trial.trial == number), None)
         if trial is None:
             raise ConfigError(f"trial = {number!r} is not one of this study (0 to {len(shown) - 1})")
         if set(chosen) != set(QUESTIONS) or not set(chosen.values()) <= {"left", "right", NEITHER}:
@@ -134,9 +134,8 @@ class Study:
         if any((answer.participant, answer.trial) == (participant, number) for answer in self._answers):
             return  # sent twice on a bad connection
         sides = {"left": trial.left, "right": trial.right, NEITHER: NEITHER}
-        given: dict[str, Any] = {"participant": participant, "trial": number, "voice": trial.voice}
         rows = [
-            Preference(**given, question=question, left=trial.left, right=trial.right, chosen=sides[chosen[question]])
+            Preference(participant=participant, question=question, chosen=sides[chosen[question]], **asdict(trial))
             for question in QUESTIONS
         ]
         append_answers(self.folder / _ANSWERS, rows)

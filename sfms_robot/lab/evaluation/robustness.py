@@ -60,7 +60,7 @@ Inputs = Literal["voice", "face", "both"]
 Degrade = Callable[[Floats, np.random.Generator], Floats]
 
 # Events per minute of people in conversation: nods of AMI's listeners, median person and speaker-rich meetings.
-RANGES: Final[Mapping[str, tuple[float, float]]] = {"nod": (3.0, 7.0), "blink": (10.0, 25.0), "smile": (0.5, 1.5)}
+RANGES: Final = {"nod": (3.0, 7.0), "blink": (10.0, 25.0), "smile": (0.5, 1.5)}
 _DISPERSION: Final = (0.7, 2.0)  # variance over mean of counts: 1 is Poisson's
 _NOISE_DB: Final = -10.0  # below speech
 _RT60_S: Final = 0.6

@@ -215,12 +215,15 @@ def offline_rollout(
     sound = listener.standardise_sound(heard.sound.float().numpy())
     sound = _led(np.where(heard.heard.numpy()[:, None, None], sound, np.float32(0)), 1)
     voice = listener.voices(np.concatenate([sound[:-1], sound[1:]], axis=1))
-    face, voice, phase = (
-        _led(part, past) for part in (listener.standardise(heard.face.numpy()), voice, heard.phase.numpy())
-    )
-    known, audible = (_led(part.numpy(), past) for part in (heard.face_known, heard.heard))  # frame t at index past + t
-    rest = listener.at_rest()
-    tokens, path = np.repeat(rest[0][None], streams, axis=0), np.repeat(rest[1][None], streams, axis=0)
+    person = {  # frame t at index past + t
+        "face": _led(listener.standardise(heard.face.numpy()), past),
+        "face_known": _led(heard.face_known.numpy(), past),
+        "voice": _led(voice, past),
+        "heard": _led(heard.heard.numpy(), past),
+        "phase": _led(heard.phase.numpy(), past),
+    }
+    at_rest, still = listener.at_rest()
+    tokens, path = np.repeat(at_rest[None], streams, axis=0), np.repeat(still[None], streams, axis=0)
     control = np.zeros((1, past + ahead, heard.control.shape[1]), np.float32)
     drawn = np.repeat(np.maximum(tokens[:, -1:], 0), frames + ahead + 1, axis=1)
     shown = np.repeat(path[:, :1], frames + ahead + 1, axis=1)
@@ -238,11 +241,7 @@ def offline_rollout(
             tokens[:, :past], tokens[:, past:] = truth[0][window], UNDECIDED
             path[:, :2] = truth[1][now : now + 2]
         seen = Context(
-            face=face[None, window],
-            face_known=known[None, window],
-            voice=voice[None, window],
-            heard=audible[None, window],
-            phase=phase[None, window],
+            **{name: rows[None, window] for name, rows in person.items()},
             tokens=tokens,
             control=np.repeat(control, streams, axis=0),
         )

@@ -18,7 +18,7 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.app.output_paths import FAINT, INK, KEY, RULE, SERIES, TRUTH, new_figure, plain, save
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import CHANNELS, FRAME_S, SHAPES, Bools, Doubles, Floats
+from sfms_robot.frames import CHANNELS, FRAME_S, SHAPES, Doubles
 from sfms_robot.lab.evaluation.rollout import run_in_processes
 from sfms_robot.lab.evaluation.table_tokenizers import (
     DenseTokenizer,
@@ -283,6 +283,7 @@ def cases(model: TableModel, windows: Tensor, takes: Sequence[str]) -> Figure:
     wrong = (restored - motion).square().mean(1).numpy()  # (W, C)
     error = wrong.mean(axis=1)
     order = error.argsort().tolist()
+    times_s = np.arange(model.window) * FRAME_S
     figure = new_figure(10.0, 8.4)
     columns = figure.subplots(_CURVES + 1, 2, squeeze=False, height_ratios=[1.5] + [1.0] * _CURVES)
     shown = (("worst", order[-1]), ("normal (median error)", order[len(order) // 2]))
@@ -298,7 +299,13 @@ def cases(model: TableModel, windows: Tensor, takes: Sequence[str]) -> Figure:
         for axes, channel in zip(curves, moving, strict=True):
             keys = keyframes[at, :, int(tokenizer.quantizer.owner[channel])].numpy()
             truth, ours = motion[at, :, channel].numpy(), restored[at, :, channel].numpy()
-            _trajectory(axes, CHANNELS[channel], truth, ours, keys)
+            axes.plot(times_s, truth, color=TRUTH, linewidth=3.2, label="recorded")
+            axes.plot(times_s, ours, color=SERIES[0], linewidth=1.4, label="from its code")
+            axes.plot(
+                times_s[keys], truth[keys], "o", color=KEY, markersize=4.5, markerfacecolor="none", label="keyframe"
+            )
+            axes.set_title(CHANNELS[channel], color=INK, fontsize=8, loc="left", pad=2)
+            plain(axes, 7)
         curves[-1].set_xlabel("s", color=INK, fontsize=8)
     columns[1, 0].legend(frameon=False, fontsize=7, labelcolor=INK)
     count = len(tokenizer.keyframes)
@@ -308,15 +315,6 @@ def cases(model: TableModel, windows: Tensor, takes: Sequence[str]) -> Figure:
         color=INK, fontsize=10,
     )  # fmt: skip
     return figure
-
-
-def _trajectory(axes: Axes, name: str, truth: Floats, ours: Floats, keys: Bools) -> None:
-    times_s = np.arange(len(truth)) * FRAME_S
-    axes.plot(times_s, truth, color=TRUTH, linewidth=3.2, label="recorded")
-    axes.plot(times_s, ours, color=SERIES[0], linewidth=1.4, label="from its code")
-    axes.plot(times_s[keys], truth[keys], "o", color=KEY, markersize=4.5, markerfacecolor="none", label="keyframe")
-    axes.set_title(name, color=INK, fontsize=8, loc="left", pad=2)
-    plain(axes, 7)
 
 
 def scores_over_steps(snapshots: Sequence[Snapshot]) -> Figure:

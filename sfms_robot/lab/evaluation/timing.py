@@ -38,7 +38,6 @@ _INTERVALS_S: Final = np.geomspace(0.2, 1200, 400)  # edges of the histogram of 
 _SIZES_DEG: Final = np.arange(0, 40.1, 0.1)  # edges of the histogram of nods by size
 _LONG_SILENCE_S: Final = 2.0
 _STRETCH_S: Final = 48.0  # of listening, whose nods are counted for their variance over mean
-_AUC: Final = "_auc"  # in the names of figures that are means over people
 _SPEECH_S: Final = (1.0, 2.0, 4.0, 8.0)  # edges of the cells of the nod table
 _SILENCE_S: Final = (0.4, 0.8, 1.2)
 _LAST_S: Final = (1.0, 3.0)
@@ -288,7 +287,7 @@ def per_person(meetings: Iterable[tuple[str, Sums]]) -> list[Sums]:
         return np.array([numbers[0] / numbers[1], 1.0]) if numbers[1] else np.zeros(2)
 
     return [
-        {name: once(numbers) if _AUC in name else numbers for name, numbers in added(parts).items()}
+        {name: once(numbers) if "_auc" in name else numbers for name, numbers in added(parts).items()}
         for _, parts in sorted(by_name.items())
     ]
 

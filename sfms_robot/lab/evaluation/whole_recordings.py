@@ -273,10 +273,6 @@ def _levels_db(pieces: Sequence[Floats]) -> Doubles:
     return np.array(levels_db)
 
 
-_SINCE_END: Final = ("nod", "laugh", "smile", "shake", "tilt", "brow_raise")
-_SINCE_BEGIN: Final = {"nod_s": "nod", "mm_hm_s": "mm_hm", "blink_s": "blink"}
-
-
 def done_at(
     spans_s: Mapping[str, Doubles], now_s: Doubles, log_rate: Doubles | float, aside: Bools | None = None
 ) -> Doubles:
@@ -285,10 +281,10 @@ def done_at(
     Kinds that are not there have never been. `aside` (K,): which of the gaze shifts go away from the person.
     """
     columns: dict[str, Doubles | float] = {name: np.full(len(now_s), np.inf) for name in DONE}
-    for kind in _SINCE_END:
+    for kind in ("nod", "laugh", "smile", "shake", "tilt", "brow_raise"):
         columns[f"{kind}_end_s"] = _since_newest(spans_s.get(kind), now_s, ends=True)
-    for name, kind in _SINCE_BEGIN.items():
-        columns[name] = _since_newest(spans_s.get(kind), now_s)
+    for kind in ("nod", "mm_hm", "blink"):
+        columns[f"{kind}_s"] = _since_newest(spans_s.get(kind), now_s)
     nods = np.sort(spans_s.get("nod", np.zeros((0, 2)))[:, 0])
     begun, earlier = (np.searchsorted(nods, now_s - ago_s - EPS_S) for ago_s in (0.0, COUNTED_S))
     columns["root_nods_30s"] = np.sqrt(begun - earlier)
@@ -388,20 +384,15 @@ def event_spans(events: Sequence[ListenerEvent], kind: str) -> Doubles:
     return np.array([(one.start_s, one.end_s) for one in events if one.kind == kind], np.float64).reshape(-1, 2)
 
 
-def _listening(heard: Doubles) -> Bools:
-    """Return (M,) whether another person has spoken just now, and oneself does not."""
-    spoken = ~(np.isnan(heard[:, AT["phrase_s"]]) & np.isnan(heard[:, AT["last_phrase_s"]]))
-    return np.asarray(spoken & (heard[:, AT["silence_s"]] <= LISTENING_S) & (heard[:, AT["own_voice_s"]] > 0))
-
-
 def _answers(kind: str, heard: Doubles) -> Bools:
     """Return (M,) whether a kind may begin, by what the others do."""
     if kind in ALWAYS:
         return np.ones(len(heard), bool)
-    listening = _listening(heard)
+    spoken = ~(np.isnan(heard[:, AT["phrase_s"]]) & np.isnan(heard[:, AT["last_phrase_s"]]))
+    answered = spoken & (heard[:, AT["silence_s"]] <= LISTENING_S)  # another person has spoken just now
     if kind == "smile":
-        listening |= (heard[:, AT["others_smile_s"]] <= LISTENING_S) & (heard[:, AT["own_voice_s"]] > 0)
-    return listening
+        answered |= heard[:, AT["others_smile_s"]] <= LISTENING_S
+    return np.asarray(answered & (heard[:, AT["own_voice_s"]] > 0))
 
 
 def _may_happen(heard: Doubles, spans_s: Mapping[str, Doubles], away: Bools, now_s: Doubles) -> dict[str, Bools]:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+from sfms_robot.errors import ConfigError
 from sfms_robot.lab.corpora.external.l2l import l2l_mean_std
 from sfms_robot.lab.evaluation import metrics
 
@@ -48,9 +49,9 @@ def test_shannon_index_is_log_k_of_even_use_and_counts_nearest_centres():
         return -sum(share * np.log2(share + 1e-6) for share in shares)
 
     assert metrics.shannon_index(pred, centres, "bits") == pytest.approx(entropy(pred.reshape(-1, 3)))
-    with pytest.raises(ValueError, match="200 frames do not make 201 clusters"):
+    with pytest.raises(ConfigError, match="200 frames do not make 201 clusters"):
         metrics.cluster_centres(reference, 201)
-    with pytest.raises(ValueError, match="200 frames differ too little to make 3 clusters"):
+    with pytest.raises(ConfigError, match="200 frames differ too little to make 3 clusters"):
         metrics.cluster_centres(np.zeros_like(reference), 3)
 
 

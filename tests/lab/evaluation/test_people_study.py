@@ -154,7 +154,7 @@ def answers(counts, question="person", left="a", right="b", people=1):
 def test_everybody_sees_every_pair_with_every_voice_once_with_even_sides():
     shown = trials(["a", "b", "c"], 4, seed=1, participant="x")
     pairs = Counter((trial.voice, frozenset((trial.left, trial.right))) for trial in shown)
-    assert len(pairs) == 12 and set(pairs.values()) == {1} and [t.number for t in shown] == list(range(12))
+    assert len(pairs) == 12 and set(pairs.values()) == {1} and [t.trial for t in shown] == list(range(12))
     assert shown == trials(["a", "b", "c"], 4, seed=1, participant="x")
     assert shown != trials(["a", "b", "c"], 4, seed=1, participant="y")
     left = sum(trial.left == "a" for n in range(200) for trial in trials(["a", "b"], 5, 0, str(n)))
