@@ -229,10 +229,8 @@ def _recorded_plans() -> list[Plan]:
     from sfms_robot.app.head.head_check import named_faces  # loads scipy, whose memory is not that of a run
 
     need = int(_RETARGET_TICKS / _RETARGET_HZ / FRAME_S) + 2 * _HORIZON
-    clips: list[Floats] = []
-    while sum(map(len, clips)) < need:
-        clips += [clip for _, clip in named_faces() if len(clip) > _HORIZON]
-    faces = np.concatenate(clips)
+    clips = [clip for _, clip in named_faces() if len(clip) > _HORIZON]
+    faces = np.resize(np.concatenate(clips), (need, MOTION_DIM))
     return [
         Plan(k * FRAME_S, FRAME_S * np.arange(k + 1.0, k + _HORIZON + 1), faces[k : k + _HORIZON])
         for k in range(0, need - _HORIZON, _HOP)

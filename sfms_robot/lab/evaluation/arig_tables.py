@@ -199,8 +199,7 @@ def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bo
         if models is None:
             raise ConfigError(f"--table {name}: needs --models DIR, where its listeners are trained and kept")
         unchanged = "arig-as-written" if options.training is None else "arig"
-        rows: dict[str, Mapping[str, Any]] = {"ARIG": {}, **PRINTED[name].get("readings", {})}
-        rows |= {label: {"changes": changes} for label, changes in PRINTED[name]["ablations"].items()}
+        rows = {"ARIG": {}, **PRINTED[name].get("readings", {}), **PRINTED[name]["ablations"]}
         folders = {
             label: [
                 trained("arig", TrainOptions(

@@ -26,7 +26,6 @@ from sfms_robot.signals.motion_primitives import Motions
 
 _IN_TIME_S: Final = 0.12
 _LOOSE_S: Final = 0.5  # further apart is not a pair
-_SHOWS_AS: Final[Mapping[str, tuple[str, ...]]] = {"smile": ("laugh",)}  # what else looks like one, and is not counted
 _EDGE_S: Final = 1.0  # an event that begins this close to the end of a motion may not be over
 _SIZES: Final[Mapping[str, tuple[float, ...]]] = {  # edges of the ranges of sizes
     "nod": tuple(np.deg2rad([0, 2, 3, 4, 6, 9, 180])),
@@ -149,11 +148,12 @@ def asked_and_seen(
     found = {}
     for kind, shown in detected.events.items():
         wanted = [event for event in asked if event.kind == kind and 0 <= event.start_s < last_s]
-        others = [event for event in asked if event.kind in _SHOWS_AS.get(kind, ())]
+        # A laugh looks like a smile, and is not counted as one.
+        laughs = [event for event in asked if kind == "smile" and event.kind == "laugh"]
         starts_s = np.array([
             start for start, _, _ in shown
             if start < last_s + _LOOSE_S
-            and not any(event.start_s - _LOOSE_S <= start <= event.end_s + _LOOSE_S for event in others)
+            and not any(event.start_s - _LOOSE_S <= start <= event.end_s + _LOOSE_S for event in laughs)
         ])  # fmt: skip
         lag = (lag_s or {}).get(kind, 0.0)
         pairs = paired(np.array([event.start_s for event in wanted]) + lag, starts_s, _LOOSE_S)

@@ -40,7 +40,6 @@ from sfms_robot.lab.evaluation.rollout import (
     offline_rollout,
     rollout,
     rollouts,
-    whole_clips,
 )
 from sfms_robot.lab.learning.corpus import in_space
 from sfms_robot.lab.learning.sfms.features import frames_of, gather
@@ -357,5 +356,5 @@ def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequenc
         raise ConfigError(
             f"dyad {dyad.name}: {dyad.fps:g} frames a second; listeners of other kinds than sfms need {FRAME_HZ}"
         )
-    heard = whole_clips(frames_of_dyad(dyad), frames)
-    return np.stack([space.encode(one) for one in rollout(listener, heard, seeds).motion])
+    played = rollout(listener, frames_of_dyad(dyad, frames), seeds)
+    return np.stack([space.encode(one) for one in played.motion])

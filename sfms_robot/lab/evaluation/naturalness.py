@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import product
+from itertools import chain, cycle, islice, product
 from pathlib import Path
 from typing import Any, Final
 
@@ -42,16 +42,15 @@ from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
 from sfms_robot.ports import Listener
 
-_BEGINNINGS: Final[Mapping[str, tuple[str, ...]]] = {  # of the names of a region's channels
-    "head": POSE_CHANNELS,
-    "eyes": ("eyeLook",),
-    "lids": ("eyeBlink", "eyeSquint", "eyeWide"),
-    "mouth": ("jaw", "mouth", "cheek", "nose", "tongue"),
-    "brows": ("brow",),
-}
-REGIONS: Final = {
+REGIONS: Final = {  # by the beginnings of their channels' names
     region: [index for index, name in enumerate(CHANNELS) if name.startswith(names)]
-    for region, names in _BEGINNINGS.items()
+    for region, names in {
+        "head": POSE_CHANNELS,
+        "eyes": ("eyeLook",),
+        "lids": ("eyeBlink", "eyeSquint", "eyeWide"),
+        "mouth": ("jaw", "mouth", "cheek", "nose", "tongue"),
+        "brows": ("brow",),
+    }.items()
 }
 FOLDS: Final = 5
 WINDOW: Final = 2 * FRAME_HZ
@@ -139,12 +138,8 @@ def _training_windows(data: Path, count: int) -> list[Floats]:
 
 def long_run(listener: Listener, heard: Sequence[Sequence[SpeakerFrame]], drift_s: float, seed: int) -> Floats:
     """Return the motion (N, 58) of one stream that hears one person after another for `drift_s`."""
-    frames: list[SpeakerFrame] = []
-    while len(frames) < drift_s * FRAME_HZ:
-        for speaker in heard:
-            frames += speaker
-    kept = frames[: round(drift_s * FRAME_HZ)]
-    timed = [changed(frame, time_s=(index + 1) * FRAME_S) for index, frame in enumerate(kept)]
+    frames = islice(cycle(chain.from_iterable(heard)), round(drift_s * FRAME_HZ))
+    timed = [changed(frame, time_s=number * FRAME_S) for number, frame in enumerate(frames, start=1)]
     return np.asarray(rollout(listener, timed, [seed], title="a long run").motion[0])
 
 

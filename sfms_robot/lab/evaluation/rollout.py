@@ -108,14 +108,10 @@ def speaker_frames(
     return frames
 
 
-def frames_of_dyad(dyad: Dyad) -> list[SpeakerFrame]:
-    """Return both tracks of a dyad as a source does."""
-    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio, dyad.attention)
-
-
-def whole_clips(speaker: Sequence[SpeakerFrame], frames: int) -> Sequence[SpeakerFrame]:
-    """Cut off the end that does not fill a clip of `frames` frames."""
-    return speaker[: len(speaker) // frames * frames]
+def frames_of_dyad(dyad: Dyad, clip_frames: int = 1) -> list[SpeakerFrame]:
+    """Return both tracks of a dyad as a source does, without the end that does not fill a clip of `clip_frames`."""
+    whole = len(dyad.speaker) // clip_frames * clip_frames
+    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio, dyad.attention)[:whole]
 
 
 # --- frame by frame -------------------------------------------------------------------------------------------------
@@ -180,10 +176,10 @@ def rollout(
 def rollouts(listener: Listener, dyads: Iterable[Dyad], seed: int, clip_frames: int = 1) -> list[Rollout]:
     """Play one stream through every dyad from its beginning, with seeds from `seed` on.
 
-    A listener that follows events receives those of the dyad's listener. `clip_frames`: see `whole_clips`.
+    A listener that follows events receives those of the dyad's listener. `clip_frames`: see `frames_of_dyad`.
     """
     return [
-        rollout(listener, whole_clips(frames_of_dyad(dyad), clip_frames), [seed + number], dyad.events or ())
+        rollout(listener, frames_of_dyad(dyad, clip_frames), [seed + number], dyad.events or ())
         for number, dyad in enumerate(dyads)
     ]
 

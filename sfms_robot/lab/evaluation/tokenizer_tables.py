@@ -34,7 +34,7 @@ from torch import Tensor
 from sfms_robot.app.progress import tracked
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, SHAPES, Doubles
+from sfms_robot.frames import SHAPES, Doubles
 from sfms_robot.lab.corpora.clips import read_takes
 from sfms_robot.lab.evaluation.intervals import LEAST_SEEDS, verdict
 from sfms_robot.lab.evaluation.metrics import dtw
@@ -58,7 +58,7 @@ DYNAMIC_AS_WRITTEN: Final = "Dynamic (Algorithm 1, as written)"
 _STATIC, _CENTRED, _EXACT = "Static (every N/k-th)", "Static, centred", "Exact"
 _BESIDE: Final = {"static": _STATIC, "static_centred": _CENTRED}
 _KEYFRAMES: Final = (3, 7, 10)  # of table III
-_ANGLES: Final = slice(CHANNEL_INDEX["roll"], CHANNEL_INDEX["yaw"] + 1)
+_ANGLES: Final = slice(0, 3)  # roll, pitch, yaw
 _ROUNDS: Final = 20
 
 log = logging.getLogger(__name__)

@@ -56,11 +56,8 @@ def test_ticks_that_did_not_come_are_missed():
 
 def test_missed_ticks_are_laid_to_the_blow_before_them():
     times_s = np.delete(np.arange(0, 60, TICK_S), [1010, 1011, 4000])
-    assert missed_ticks(times_s, [10.0]) == {
-        "after_a_blow": 2,
-        "otherwise": 1,
-        "expected_after_a_blow": pytest.approx(0.59, abs=0.02),
-    }
+    expected = {"after_a_blow": 2, "otherwise": 1, "expected_after_a_blow": pytest.approx(0.59, abs=0.02)}
+    assert missed_ticks(times_s, [10.0]) == expected
     assert missed_ticks(times_s, [])["after_a_blow"] == 0
 
 
@@ -68,10 +65,8 @@ def test_missed_ticks_are_laid_to_the_blow_before_them():
     "degraded_s, well_s, passed", [(0.9, 5.0, True), (None, 0.0, False), (2.5, 5.0, False), (0.9, None, False)]
 )
 def test_a_blow_passes_when_the_run_says_so_in_time_and_is_well_again(degraded_s, well_s, passed):
-    assert (
-        Blow(kind="killed", what="listener", why="listener", at_s=3.0, degraded_s=degraded_s, well_s=well_s).passed
-        == passed
-    )
+    blow = Blow(kind="killed", what="listener", why="listener", at_s=3.0, degraded_s=degraded_s, well_s=well_s)
+    assert blow.passed == passed
 
 
 def test_a_figure_that_was_not_measured_is_neither_met_nor_missed():

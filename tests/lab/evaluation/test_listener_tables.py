@@ -13,7 +13,7 @@ from sfms_robot.lab.corpora.collection import Clip, Dataset
 from sfms_robot.lab.evaluation import listener_tables as tables
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.metrics import cut
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts, whole_clips
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts
 from sfms_robot.listeners.sfms.stream import SfmsListener
 
 COLUMNS = {1: ("L2", "FD", "Var", "SI", "P-FD", "RPCC"), 2: ("FRCorr", "FRDist", "FRDiv", "FRVar", "FRDvs", "FRSyn")}
@@ -121,8 +121,7 @@ def test_a_plan_from_the_true_past_begins_where_the_truth_is():
 
 def test_what_is_no_whole_clip_is_not_played():
     one, model = dyad("a", 45), listener()
-    heard = frames_of_dyad(one)
-    assert [len(whole_clips(heard, frames)) for frames in (1, 10, 45, 50)] == [45, 40, 45, 0]
+    assert [len(frames_of_dyad(one, frames)) for frames in (1, 10, 45, 50)] == [45, 40, 45, 0]
     whole, clips = (rollouts(model, [one], 3, clip_frames=frames)[0].motion for frames in (1, 10))
     np.testing.assert_array_equal(clips, whole[:, :40])
 

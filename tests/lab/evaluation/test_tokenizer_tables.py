@@ -153,10 +153,8 @@ def test_names_say_seed_steps_and_learning_rate_and_every_table_needs_only_recip
     assert {*COMPARED["shipped"]} == {folder.name for folder in (data_dir("configs") / "tokenizers").iterdir()}
     assert [recipe_of(name).seed for name in seeded("sparse-all-k3", 3)] == [1, 2, 3]
     written = "sparse-all-k7-as-written"
-    assert (
-        recipe_of(f"{written}-8000-seed2").training.steps == 8000
-        and recipe_of(f"{written}-8000", steps=2).training.steps == 2
-    )
+    assert recipe_of(f"{written}-8000-seed2").training.steps == 8000
+    assert recipe_of(f"{written}-8000", steps=2).training.steps == 2
     assert recipe_of(f"{written}-slower-scores").training.score_learning_rate == 3e-4
     assert recipe_of(f"{written}-tempered").training.tempered_draws
 
