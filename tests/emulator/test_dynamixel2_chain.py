@@ -55,8 +55,7 @@ def host():
 
 
 def test_unknown_id_and_other_baud_are_silence(host):
-    assert host.ask(9, dxl2.PING) == []
-    assert host.ask(1, dxl2.PING, baud=57600) == []
+    assert host.ask(9, dxl2.PING) == [] and host.ask(1, dxl2.PING, baud=57600) == []
     assert host.ask(1, dxl2.PING, baud=None) == host.ask(1, dxl2.PING, baud=921_600) == []
     assert len(host.ask(1, dxl2.PING, baud=1_020_000)) == 1
 
@@ -74,24 +73,20 @@ def test_unknown_id_and_other_baud_are_silence(host):
 )
 def test_write_is_checked(host, name, value, error):
     before = host.read(1, name)
-    assert host.write(1, name, value) == error
-    assert host.read(1, name) == (before if error else value)
+    assert host.write(1, name, value) == error and host.read(1, name) == (before if error else value)
 
 
 def test_what_may_not_be_done_is_refused(host):
     assert host.write(1, "torque_enable", 1) == 0
-    assert host.write(1, "return_delay_time", 0) == dxl2.ACCESS_ERROR
-    assert host.write(1, "led", 1) == 0
+    assert host.write(1, "return_delay_time", 0) == dxl2.ACCESS_ERROR and host.write(1, "led", 1) == 0
     assert [packet.error for packet in host.ask(1, 0x77)] == [dxl2.INSTRUCTION_ERROR]
 
 
 def test_status_return_level_decides_who_answers(host):
     assert host.ask(1, dxl2.WRITE, words(68) + b"\x01") == []  # the new level counts at once
-    assert host.ask(1, dxl2.WRITE, words(65) + b"\x01") == []
-    assert host.read(1, "led") == 1
+    assert host.ask(1, dxl2.WRITE, words(65) + b"\x01") == [] and host.read(1, "led") == 1
     host.ask(1, dxl2.WRITE, words(68) + b"\x00")
-    assert host.ask(1, dxl2.READ, words(65, 1)) == []
-    assert len(host.ask(1, dxl2.PING)) == 1
+    assert host.ask(1, dxl2.READ, words(65, 1)) == [] and len(host.ask(1, dxl2.PING)) == 1
 
 
 def test_sync_read_is_answered_in_list_order_up_to_the_first_silent_id_and_broadcast_ping_in_slots(host):
@@ -170,7 +165,6 @@ def test_second_id_obeys_and_says_nothing(host):
 
 def test_a_changed_id_is_answered_under_the_old_one_and_two_of_one_id_talk_over_one_another(host):
     assert [p.servo for p in host.ask(3, dxl2.WRITE, words(7) + b"\x09")] == [3]
-    assert [p.servo for p in host.ask(9, dxl2.PING)] == [9]
-    assert host.write(2, "id", 1) == 0
+    assert [p.servo for p in host.ask(9, dxl2.PING)] == [9] and host.write(2, "id", 1) == 0
     both = host.replies(1, dxl2.READ, POSITIONS)
     assert len(both) == 1 and maybe_packet(bytearray(both[0].data)) is None  # 2001 and 2002 at once: the crc is wrong

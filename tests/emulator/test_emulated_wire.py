@@ -29,16 +29,14 @@ def sync_read(*ids: int) -> bytes:
 
 
 def ids_in(outs) -> list[int]:
-    buffer = bytearray(b"".join(out.data for out in outs))
-    found = []
+    buffer, found = bytearray(b"".join(out.data for out in outs)), []
     while (packet := maybe_packet(buffer)) is not None:
         found.append(packet.servo)
     return found
 
 
 def test_on_the_wire_a_byte_takes_ten_bits_and_a_servo_its_delay():
-    wire = wire_of(1, 2, timing="wire")
-    request = sync_read(1, 2)
+    wire, request = wire_of(1, 2, timing="wire"), sync_read(1, 2)
     wire.receive(request, BAUD, 1.0)
     assert wire.take(1.0) == []
     first, second = wire.take(2.0)
@@ -82,8 +80,7 @@ def test_request_that_is_dropped_or_corrupted_is_not_obeyed():
     wire = wire_of(1, faults=["request-drop@1-2", "request-corrupt@2-3"])
     for now_s, obeyed in ((0.5, True), (1.5, False), (2.5, False), (3.5, True)):
         wire.receive(write_led(1, 1), BAUD, now_s)
-        assert bool(wire.take(now_s)) == obeyed
-        assert wire.servo(1).read(65, 1, now_s)[1] == bytes([obeyed])
+        assert bool(wire.take(now_s)) == obeyed and wire.servo(1).read(65, 1, now_s)[1] == bytes([obeyed])
         wire.servo(1).write(65, b"\x00", now_s)
     assert wire.digest()[1] == 4 * len(write_led(1, 1))  # the host has sent them all
 
@@ -113,8 +110,7 @@ def test_unplugging_the_adapter_loses_requests_on_their_way():
 
 
 def test_echo_comes_before_the_answer_and_noise_behind():
-    wire = wire_of(1, faults=["echo", "noise"])
-    request = sync_read(1)
+    wire, request = wire_of(1, faults=["echo", "noise"]), sync_read(1)
     wire.receive(request, BAUD, 0.0)
     sent = b"".join(out.data for out in wire.take(0.0))
     assert sent.startswith(request) and len(sent) > len(request) + 15
@@ -166,8 +162,7 @@ def test_mute_servo_obeys_and_never_answers(chain_break):
     for now_s, answers, order in ((0.5, [2], [1, 2, 3]), (2.0, [], behind), (3.5, [2], [1, 2, 3])):
         chain.servo(2).write(64, b"\0", now_s)
         wire.receive(torque_on, BAUD, now_s)
-        assert ids_in(wire.take(now_s)) == answers
-        assert chain.servo(2).state(now_s)["torque"]
+        assert ids_in(wire.take(now_s)) == answers and chain.servo(2).state(now_s)["torque"]
         wire.receive(sync_read(1, 2, 3), BAUD, now_s)
         assert ids_in(wire.take(now_s)) == order
         wire.receive(encode_instruction(dxl2.BROADCAST, dxl2.PING), BAUD, now_s)
@@ -179,5 +174,4 @@ def test_board_is_mute_when_all_its_channels_are():
     wire = EmulatedWire([board], "instant", [parse_fault("mute@1-2")], 0)
     for now_s, answers in ((0.5, 1), (1.5, 0), (2.5, 1)):
         wire.receive(f"#0P{1500 + round(now_s)}\rQ\r".encode(), 9600, now_s)
-        assert len(wire.take(now_s)) == answers
-        assert board.channels[0].goal == 1500 + round(now_s)
+        assert len(wire.take(now_s)) == answers and board.channels[0].goal == 1500 + round(now_s)

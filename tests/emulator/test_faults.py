@@ -75,10 +75,8 @@ def spoilt(*specs: str, servos=SENDER, now_s: float = 0.0):
 
 
 def test_what_becomes_of_a_reply():
-    assert spoilt() == [(REPLY, 0.0)]
-    assert spoilt("drop") == []
-    assert spoilt("duplicate") == [(REPLY, 0.0)] * 2
-    assert spoilt("delay=0.01") == [(REPLY, 0.01)]
+    assert spoilt() == [(REPLY, 0.0)] and spoilt("drop") == []
+    assert spoilt("duplicate") == [(REPLY, 0.0)] * 2 and spoilt("delay=0.01") == [(REPLY, 0.01)]
     [(short, _)] = spoilt("truncate")
     assert REPLY.startswith(short) and len(short) < 40
     [(wrong, _)] = spoilt("corrupt")
@@ -105,8 +103,7 @@ def test_one_seed_throws_the_same_dice():
         faults = faults_of("drop=0.5", "corrupt=0.5", seed=seed)
         return [faults.spoil(SENDER, REPLY, 0.01 * k) for k in range(200)]
 
-    assert run(1) == run(1) != run(2)
-    assert 60 < sum(not replies for replies in run(1)) < 140
+    assert run(1) == run(1) != run(2) and 60 < sum(not replies for replies in run(1)) < 140
 
 
 def test_beginnings_and_ends_come_once_in_order_and_clearing_ends_what_goes_on():

@@ -144,8 +144,7 @@ def test_feetech_turns_and_id():
 def test_feetech_with_the_high_byte_first():
     chain = servos("scs0009", 1)
     request = "write pos 512 time 0 speed 0 id1 (high byte first)"
-    assert chain.receive(OLD[request], BAUD, 0.0) == status1(1, 0)
-    assert chain.servo(1).state(0.0)["goal"] == 512
+    assert chain.receive(OLD[request], BAUD, 0.0) == status1(1, 0) and chain.servo(1).state(0.0)["goal"] == 512
 
 
 @pytest.fixture

@@ -25,12 +25,10 @@ def phone(receiver):
 
 def test_the_shipped_packets_are_one_phones_and_a_number_is_all_that_changes():
     packets = recorded_packets()
-    assert len(packets) == 180
-    assert {parse_packet(each).subject for each in packets} == {"LLV Default Device"}
+    assert len(packets) == 180 and {parse_packet(each).subject for each in packets} == {"LLV Default Device"}
     first = recorded_packets()[0]
     again = renumbered(first, 7)
-    assert parse_packet(again).number == 7
-    assert renumbered(again, parse_packet(first).number) == first
+    assert parse_packet(again).number == 7 and renumbered(again, parse_packet(first).number) == first
 
 
 def test_the_stream_goes_on_without_a_jump(phone):

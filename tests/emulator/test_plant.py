@@ -27,8 +27,7 @@ def test_goal_is_reached_without_overshoot_and_below_top_speed(start, goal, spee
     low, high = min(start, goal), max(start, goal)
     for k in range(2000):
         plant.advance(k * 0.002, drive)
-        assert abs(plant.speed) <= TOP
-        assert low - 10 <= plant.position <= high + 10
+        assert abs(plant.speed) <= TOP and low - 10 <= plant.position <= high + 10
     assert plant.position == goal and plant.speed == 0.0
 
 

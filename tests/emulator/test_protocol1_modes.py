@@ -21,8 +21,7 @@ class Bench:
 
     def send(self, code, *params):
         body = [1, len(params) + 2, code, *params]
-        frame = bytes([255, 255, *body, ~sum(body) & 255])
-        return self.device.receive(frame, BAUD, self.now_s)
+        return self.device.receive(bytes([255, 255, *body, ~sum(body) & 255]), BAUD, self.now_s)
 
     def word(self, value):
         value &= 0xFFFF
@@ -33,8 +32,7 @@ class Bench:
         assert answer[:2] == b"\xff\xff" and answer[4] == 0, answer.hex(" ")
 
     def read(self, address, size=2):
-        data = self.send(2, address, size)[5:-1]
-        return int.from_bytes(data, "big" if self.high_first else "little")
+        return int.from_bytes(self.send(2, address, size)[5:-1], "big" if self.high_first else "little")
 
     def after(self, seconds):
         self.now_s += seconds
@@ -103,16 +101,14 @@ def test_mx_multi_turn_offset_and_divider():
     assert bench.read(36) == 2048
     bench.write(30, *bench.word(2148))
     shaft = bench.device.servo(1).plant.position
-    assert bench.after(10.0).read(36) == 2148
-    assert bench.device.servo(1).plant.position - shaft == pytest.approx(400)
+    assert bench.after(10.0).read(36) == 2148 and bench.device.servo(1).plant.position - shaft == pytest.approx(400)
 
 
 @pytest.mark.parametrize(("phase", "seen"), [(12, 3000 % 4096), (12 | 16, 3000 + 4096)])
 def test_sts_counts_turns_when_its_phase_says_so(phase, seen):
     bench = Bench(STS, 100, min_position_limit=0, max_position_limit=0, phase=phase)
     bench.write(42, *bench.word(3000 + 4096))
-    assert bench.after(20.0).read(56) == seen
-    assert bench.shaft == 3000 + 4096
+    assert bench.after(20.0).read(56) == seen and bench.shaft == 3000 + 4096
 
 
 def test_sts_steps_add_up():
@@ -131,8 +127,7 @@ def test_registered_write_is_pending_until_action(model, goal, pending):
     bench.send(4, goal, *bench.word(600))  # REG WRITE
     assert bench.read(pending, 1) == 1 and bench.read(goal) != 600
     bench.send(5)  # ACTION
-    assert bench.read(pending, 1) == 0
-    assert bench.read(goal) == 600
+    assert bench.read(pending, 1) == 0 and bench.read(goal) == 600
     bench.send(4, goal, *bench.word(601))
     bench.device.servo(1).power_cycle(0.0)
     assert bench.read(pending, 1) == 0

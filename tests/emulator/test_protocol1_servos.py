@@ -54,8 +54,7 @@ def test_feetech_takes_what_it_can_and_says_nothing():
     device = chain_of("scs0009")
     assert put(device, 1, "goal_position", 5) == 0
     assert get(device, 1, "goal_position") == 20  # its own limit
-    assert ask(device, 1, protocol1.WRITE, bytes([56, 0, 0]))[0].code == 0
-    assert ask(device, 1, 0x77) == []
+    assert ask(device, 1, protocol1.WRITE, bytes([56, 0, 0]))[0].code == 0 and ask(device, 1, 0x77) == []
 
 
 def test_locked_eeprom_forgets_on_feetech():
@@ -110,8 +109,7 @@ def test_factory_reset_gives_back_id_and_baud():
     put(device, 1, "lock", 0)
     assert ask(device, 1, protocol1.WRITE, bytes([5, 9])) == [Frame(1, 0, b"")]  # the old id says yes
     assert ask(device, 1, protocol1.PING) == []
-    assert ask(device, 9, protocol1.FACTORY_RESET) == [Frame(9, 0, b"")]
-    assert get(device, 1, "id") == 1
+    assert ask(device, 9, protocol1.FACTORY_RESET) == [Frame(9, 0, b"")] and get(device, 1, "id") == 1
 
 
 def test_overload_comes_from_the_motor_and_takes_the_torque():
@@ -130,8 +128,7 @@ def test_overload_comes_from_the_motor_and_takes_the_torque():
 def test_voltage_bit_is_there_as_long_as_the_voltage_is_wrong():
     device = chain_of("sts3215")
     device.servo(1).set_supply(9.5, 0.0)
-    assert ask(device, 1, protocol1.PING)[0].code == protocol1.VOLTAGE
-    assert get(device, 1, "present_voltage") == 95
+    assert ask(device, 1, protocol1.PING)[0].code == protocol1.VOLTAGE and get(device, 1, "present_voltage") == 95
     device.servo(1).set_supply(7.4, 0.0)
     assert ask(device, 1, protocol1.PING)[0].code == 0
 
@@ -145,8 +142,7 @@ def test_sts_is_calibrated_where_it_stands(how):
         ask(device, 1, protocol1.CALIBRATE_OFFSET)
     assert (get(device, 1, "present_position"), get(device, 1, "homing_offset")) == (2048, 952)
     put(device, 1, "goal_position", 2148)
-    assert get(device, 1, "present_position", 2.0) == 2148
-    assert device.servo(1).plant.position == 3100
+    assert get(device, 1, "present_position", 2.0) == 2148 and device.servo(1).plant.position == 3100
 
 
 def test_two_servos_with_one_id_both_answer():

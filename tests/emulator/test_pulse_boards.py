@@ -30,12 +30,10 @@ def test_boards_hear_their_own_baud_rate_alone():
     assert board.receive(AA + maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
     assert board.receive(maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
     board = device_of(*servos_of("maestro-24", 0))
-    assert board.receive(maestro.addressed(maestro.get_errors()), 57600, 0.0) == b"\x00\x00"
-    assert board.baud == 57600
+    assert board.receive(maestro.addressed(maestro.get_errors()), 57600, 0.0) == b"\x00\x00" and board.baud == 57600
     board = maestro_board()
     board.receive(maestro.set_target(0, 6000), 115200, 0.0)
-    assert board.receive(maestro.get_errors(), 9600, 0.0) == b""
-    assert errors(board) == maestro.SIGNAL_ERROR
+    assert board.receive(maestro.get_errors(), 9600, 0.0) == b"" and errors(board) == maestro.SIGNAL_ERROR
     assert position(board, 0, 0.0) == 0  # an error sends all home, and home is off
     assert ssc_board().receive(ssc32.query_moving(), 9600, 0.0) == b""
 
@@ -43,8 +41,7 @@ def test_boards_hear_their_own_baud_rate_alone():
 def test_target_without_a_speed_limit_is_there_at_once_and_the_shaft_follows():
     board = maestro_board(start_ticks=6000)
     board.receive(maestro.set_target(2, 7000), 115200, 1.0)
-    assert position(board, 2, 1.0) == 7000
-    assert board.servo(2).plant.position == 6000
+    assert position(board, 2, 1.0) == 7000 and board.servo(2).plant.position == 6000
     board.advance(2.0)
     assert board.servo(2).plant.position == 7000
 
@@ -56,16 +53,14 @@ def test_speed_limit_holds_once_pulses_are_on():
     board.receive(maestro.set_target(0, 7000), 115200, 0.0)
     assert board.receive(bytes([maestro.GET_MOVING]), 115200, 0.1) == b"\x01"
     assert position(board, 0, 0.5) == pytest.approx(6000, abs=10)  # 20 x 0.25 us per 10 ms = 2000 ticks/s
-    assert position(board, 0, 1.5) == 7000
-    assert board.receive(bytes([maestro.GET_MOVING]), 115200, 1.5) == b"\x00"
+    assert position(board, 0, 1.5) == 7000 and board.receive(bytes([maestro.GET_MOVING]), 115200, 1.5) == b"\x00"
 
 
 def test_smallest_acceleration_takes_about_three_seconds_for_a_millisecond_of_pulse():
     board = maestro_board()
     board.receive(bytes([maestro.SET_ACCELERATION, 0]) + maestro.word(1) + maestro.set_target(0, 4000), 115200, 0.0)
     board.receive(maestro.set_target(0, 8000), 115200, 0.0)
-    assert 7900 > position(board, 0, 2.5) > 6000
-    assert position(board, 0, 4.0) == 8000
+    assert 7900 > position(board, 0, 2.5) > 6000 and position(board, 0, 4.0) == 8000
 
 
 def test_targets_are_held_inside_the_limits_of_a_channel_and_a_micro_maestro_knows_no_multiple_ones():
@@ -81,8 +76,7 @@ def test_targets_are_held_inside_the_limits_of_a_channel_and_a_micro_maestro_kno
 def test_nonsense_is_a_protocol_error_and_reading_it_clears_it(command):
     board = maestro_board()
     board.receive(command, 115200, 0.0)
-    assert errors(board) == maestro.PROTOCOL_ERROR
-    assert errors(board) == 0
+    assert errors(board) == maestro.PROTOCOL_ERROR and errors(board) == 0
 
 
 def test_a_channel_without_pulses_stays_where_it_is_and_one_without_a_servo_is_none():
@@ -147,8 +141,7 @@ def test_slower_of_speed_and_time_counts():
 
 @given(st.lists(st.binary(max_size=64), max_size=20), st.sampled_from(["maestro-24", "maestro-6", "ssc-32"]))
 def test_rubbish_moves_no_channel_out_of_its_limits(chunks, model):
-    board = device_of(*servos_of(model, *range(6), baud=9600))
-    now_s = 0.0
+    board, now_s = device_of(*servos_of(model, *range(6), baud=9600)), 0.0
     for chunk in [AA, *chunks]:
         now_s += 0.01
         board.receive(chunk, 9600, now_s)

@@ -21,8 +21,7 @@ def test_every_model_jumps_to_the_middle_under_torque_and_then_goes_where_it_is_
     assert bench.after(0.5) == center - 150 and bench.get("model_number") == (bench.table.model_number or 0)
     assert bench.put(torque_enable=1) == 0 and bench.after(3.0) == center
     assert bench.put(goal_position=center + 100) == 0
-    assert center < bench.after(0.02) < center + 100 == bench.after(3.0)
-    assert bench.servo.fault_status == 0
+    assert center < bench.after(0.02) < center + 100 == bench.after(3.0) and bench.servo.fault_status == 0
 
 
 @pytest.mark.parametrize("model", FAMILIES)
@@ -125,8 +124,7 @@ def test_pwm_and_current_modes_turn_the_motor_with_about_half_its_strength(mode,
 def test_extended_mode_goes_past_a_turn_and_position_mode_does_not():
     bench = ServoBench(operating_mode=4)
     bench.put(torque_enable=1)
-    assert bench.put(goal_position=9000) == 0
-    assert bench.after(5.0) == 9000
+    assert bench.put(goal_position=9000) == 0 and bench.after(5.0) == 9000
     assert ServoBench().put(goal_position=9000) == dxl2.DATA_LIMIT_ERROR
 
 
@@ -145,8 +143,7 @@ def test_current_based_position_mode_gives_way_where_position_mode_overloads():
 def test_profile_by_time_arrives_in_that_time():
     bench = ServoBench(drive_mode=4, start=2000)
     bench.put(profile_velocity=1000, profile_acceleration=200, torque_enable=1, goal_position=3000)
-    assert bench.after(0.5) == pytest.approx(2500, abs=60)
-    assert bench.after(0.65) == pytest.approx(3000, abs=3)
+    assert bench.after(0.5) == pytest.approx(2500, abs=60) and bench.after(0.65) == pytest.approx(3000, abs=3)
 
 
 def test_a_goal_brings_torque_where_the_drive_mode_says_so_and_a_new_mode_resets_goals():
@@ -165,8 +162,7 @@ def test_a_goal_brings_torque_where_the_drive_mode_says_so_and_a_new_mode_resets
 def test_goals_stay_below_their_limit_registers(limit, value, goal):
     bench = ServoBench()
     bench.put(**{limit: value})
-    assert bench.put(**{goal: value}) == 0
-    assert bench.put(**{goal: value + 1}) == dxl2.DATA_LIMIT_ERROR
+    assert bench.put(**{goal: value}) == 0 and bench.put(**{goal: value + 1}) == dxl2.DATA_LIMIT_ERROR
 
 
 def test_supply_outside_the_limits_raises_the_alert_for_good():
@@ -192,8 +188,7 @@ def test_load_hangs_a_little_below_the_goal_and_takes_current():
     bench = ServoBench()
     bench.put(goal_position=2048, torque_enable=1)
     bench.servo.plant.load = 0.2
-    assert 1 <= 2048 - bench.after(2.0) <= 40
-    assert bench.get("present_current") == pytest.approx(240, abs=10)
+    assert 1 <= 2048 - bench.after(2.0) <= 40 and bench.get("present_current") == pytest.approx(240, abs=10)
 
 
 def test_held_load_makes_it_warm_and_too_much_overheats_it():

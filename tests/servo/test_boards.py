@@ -15,9 +15,7 @@ def wire_of(baud=9600, patience_s=0.02):
 
 def test_wire_is_busy_until_its_bytes_have_left():
     wire, _, clock = wire_of()
-    assert wire.free
-    assert wire.send(bytes(96)) == 0.0
-    assert wire.send(bytes(96)) == 0.1
+    assert wire.free and wire.send(bytes(96)) == 0.0 and wire.send(bytes(96)) == 0.1
     clock.t = 0.19
     assert not wire.free
     clock.t = 0.2

@@ -21,8 +21,7 @@ def test_two_buses_answer_as_one_in_the_order_of_the_head():
     joints = ["joint2", "joint3", "joint1"]
     bus = CompositeBus({"one": one.bus, "two": two.bus}, joints)
     bus.connect()
-    held = bus.enable(joints)
-    assert held == pytest.approx([(t - 2048) * 2 * np.pi / 4096 for t in (2010, 2020, 2000)])
+    assert bus.enable(joints) == pytest.approx([(t - 2048) * 2 * np.pi / 4096 for t in (2010, 2020, 2000)])
     goals = np.array([0.1, 0.2, 0.3])
     for k in range(60):
         one.clock.t = two.clock.t = k * 0.01
@@ -123,8 +122,7 @@ def test_slow_bus_does_not_hold_up_the_others_and_gets_the_newest_goals():
 def test_joint_that_came_back_is_told_once_however_often_its_bus_ticks():
     slow = Gate()
     slow.open.set()
-    bus = CompositeBus({"slow": slow}, ["slow"], {"slow": 1000.0})
-    told = 0
+    bus, told = CompositeBus({"slow": slow}, ["slow"], {"slow": 1000.0}), 0
     while len(slow.written) < 5:
         bus.write(np.zeros(1), 0.0)
         told += bus.poll(0.0)["slow"].rejoined
@@ -170,12 +168,10 @@ def test_bus_that_fails_is_said_once_and_the_others_go_on(rates_hz):
 
 
 def test_torque_off_reaches_every_bus_before_any_is_asked_to_confirm():
-    order = []
-    buses = {name: Steady(name) for name in ("one", "two", "three")}
+    order, buses = [], {name: Steady(name) for name in ("one", "two", "three")}
     for each in buses.values():
         each.calls = order
-    bus = CompositeBus(buses, list(buses))
-    bus.stop("release")
+    CompositeBus(buses, list(buses)).stop("release")
     assert [call for call, _ in order] == ["torque_off"] * 3 + ["stop"] * 3
 
 

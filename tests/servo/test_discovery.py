@@ -178,10 +178,7 @@ def test_the_ports_of_this_computer_can_be_told_as_json():
         assert {"name", "path", "vendor", "by_path", "problem", "holders"} <= set(port)
 
 
-USB0, USB1 = (
-    discovery.SerialDevice("/dev/ttyUSB0", vendor="0403"),
-    discovery.SerialDevice("/dev/ttyUSB1", vendor="1a86"),
-)
+USB0, USB1 = (discovery.SerialDevice(f"/dev/ttyUSB{n}", vendor=vendor) for n, vendor in enumerate(("0403", "1a86")))
 BUILT_IN = discovery.SerialDevice("/dev/ttyS0")
 
 

@@ -36,10 +36,8 @@ def test_status_round_trip(servo, error, data):
 @given(params, st.integers(1, 200))
 @example(bytes(40), 10)  # as long as nothing says that it was cut off, its end is waited for
 def test_packet_cut_off_does_not_swallow_the_next(data, cut):
-    whole = encode_status(4, 0, b"\x01\x02")
-    part = encode_status(3, 0, data)
-    buffer = bytearray(part[: min(cut, len(part) - 3)] + whole)
-    found = []
+    whole, part = encode_status(4, 0, b"\x01\x02"), encode_status(3, 0, data)
+    buffer, found = bytearray(part[: min(cut, len(part) - 3)] + whole), []
     while (packet := take(buffer)) is not None:
         found.append(packet)
     assert found == [Packet(4, dxl2.STATUS, b"\x01\x02")]

@@ -35,17 +35,6 @@ def test_other_servo_under_the_same_id_is_not_switched_on(caplog):
     assert "is model number 1200, the head says other (77)" in caplog.text
 
 
-def test_host_that_stood_still_brings_its_servos_back():
-    rig = four(watchdog_ms=100)
-    held = rig.hold()
-    rig.ticks(held, 5)
-    rig.clock.t += 0.5  # nothing fed the watchdogs
-    back: set[str] = set()
-    rig.until(held, lambda r: back.update(j for j in r if r[j].rejoined) or len(back) == 4, 1.0)
-    assert rig.ticks(held + 0.01, 30)["joint1"].position_rad == pytest.approx(0.01, abs=2 * RAD_PER_TICK)
-    assert watchdogs(rig) == [5, 5, 5, 5]
-
-
 def test_trip_that_was_left_over_is_cleared_at_connect():
     rig = four()
     rig.set(2, "torque_enable", 1)
@@ -65,9 +54,3 @@ def test_modes_of_an_earlier_host_are_set_before_the_first_goal():
     rig.hold()
     names = "operating_mode", "drive_mode", "status_level", "return_delay"
     assert [rig.register(1, name) for name in names] == [3, 0, 2, 0]
-
-
-def test_firmware_picks_the_layout_that_the_bus_goes_by():
-    rig = plugged([EmulatedServo(1, firmware=50)])
-    rig.ticks(rig.hold(), 3)
-    assert rig.register(1, "bus_watchdog") == 0  # this firmware's watchdog does not stop the motor

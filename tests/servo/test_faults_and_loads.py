@@ -86,8 +86,7 @@ def test_alert_of_a_head_at_seven_volts_is_no_fault_by_its_own_threshold():
     faults = Faults(thresholds={"input voltage": Threshold(min=4.5, max=7.8)})
     at_7V2 = [EmulatedServo(i, supply_v=7.2, registers={"shutdown": 52}) for i in (1, 2)]
     rig = plugged(at_7V2, faults=faults)
-    held = rig.hold()
-    readings = rig.ticks(held, 60)
+    readings = rig.ticks(rig.hold(), 60)
     assert readings["joint1"].extra["voltage_V"] == pytest.approx(7.2)
     assert [r.fault for r in readings.values()] == [None, None]
     assert rig.bus.statistics()["faults"] == []
@@ -116,8 +115,7 @@ def test_every_servo_with_a_current_sensor_has_a_pinch_rule():
 
 
 def test_pinched_joint_goes_limp_and_comes_back_later():
-    gentle = Safety(pinch=LoadRule(current_mA=200, for_s=0.2))
-    rig = three(safety=gentle)
+    rig = three(safety=Safety(pinch=LoadRule(current_mA=200, for_s=0.2)))
     held = rig.hold()
     rig.ticks(held, 10)
     rig.servo(2).plant.stuck = True

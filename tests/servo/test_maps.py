@@ -29,26 +29,14 @@ REGISTERS = {
     "goal_position": {"address": 30, "size": 2, "access": "RW", "area": "RAM", "unit": "deg"},
 }
 MADE_UP = {
-    "model": "made-up",
-    "vendor": "nobody",
-    "model_number": 60000,
-    "family": "dynamixel",
-    "protocol": 1,
-    "source": "invented",
-    "ticks_per_revolution": 1000,
-    "center_ticks": 500,
-    "baud_codes": {1: 1000000},
+    "model": "made-up", "vendor": "nobody", "model_number": 60000, "family": "dynamixel", "protocol": 1,
+    "source": "invented", "ticks_per_revolution": 1000, "center_ticks": 500, "baud_codes": {1: 1000000},
     "registers": REGISTERS,
-}
+}  # fmt: skip
 BOARD = {
-    "family": "ssc32",
-    "protocol": None,
-    "model_number": None,
-    "registers": {},
-    "channels": 4,
-    "tick_us": 1,
+    "family": "ssc32", "protocol": None, "model_number": None, "registers": {}, "channels": 4, "tick_us": 1,
     "pulse_us": {"min": 500, "max": 2500},
-}
+}  # fmt: skip
 
 
 def goal(**changes: object) -> dict[str, object]:
@@ -120,8 +108,7 @@ def test_watchdog_says_what_the_servo_does():
 def test_a_servo_of_ones_own_is_a_file_and_no_python(tmp_path):
     file = write(tmp_path)
     assert Table.of(load_firmware_map(str(file))).role("goal_position").address == 30
-    assert check_maps([file]) == check_maps([tmp_path]) == []
-    assert list_maps([file])[-1]["model"] == "made-up"
+    assert check_maps([file]) == check_maps([tmp_path]) == [] and list_maps([file])[-1]["model"] == "made-up"
 
 
 def test_a_map_in_the_users_folder_is_found_by_name_and_number(tmp_path, monkeypatch):

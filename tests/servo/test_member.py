@@ -141,8 +141,7 @@ def test_events_lead_to_the_state_of_the_diagram(how, events, state, fault):
             EVENTS[name](member, *arguments)
         else:
             getattr(member, name)(*arguments)
-    assert (member.state, member.fault) == (state, fault)
-    assert member.gets_goals is (state in (ONLINE, REDUCED))
+    assert (member.state, member.fault) == (state, fault) and member.gets_goals is (state in (ONLINE, REDUCED))
     assert (member.job is not None) is (state in (RETURNING, REBOOTING))
 
 
@@ -159,8 +158,7 @@ def test_rejoining_to_online_by_a_goal_near_to_where_it_stands(member):
     member.back(1.0)
     run(member, 1.0)
     assert member.state == REJOINING and not member.accepts(STANDS + 50) and not member.gets_goals
-    assert member.accepts(STANDS + 5)
-    assert member.state == ONLINE and member.gets_goals
+    assert member.accepts(STANDS + 5) and member.state == ONLINE and member.gets_goals
 
 
 def test_returning_goes_on_after_a_silence_of_its_own(member):

@@ -81,10 +81,8 @@ def test_it_comes_inside_slowly_and_is_held_there_with_its_usual_profile(model, 
     rig.start_up()
     held = switched_on(rig.startups[0])
     assert rig.inside(held) and rig.held("torque_enable") == 1 and rig.held("goal_position") == held
-    assert rig.usual_profile()
-    assert all(rig.inside(goal) for goal in rig.goals)
-    assert 0.0 < rig.fastest_deg_s < 1.15 * SPEED_DEG_S
-    assert rig.state(1)["position"] == pytest.approx(held, abs=2)
+    assert rig.usual_profile() and all(rig.inside(goal) for goal in rig.goals)
+    assert 0.0 < rig.fastest_deg_s < 1.15 * SPEED_DEG_S and rig.state(1)["position"] == pytest.approx(held, abs=2)
     rig.clock.t += 1.0
     assert rig.state(1)["position"] == pytest.approx(held, abs=2)
 
@@ -100,8 +98,7 @@ def test_whatever_is_lost_it_never_goes_faster_or_further_out(model, fate):
         assert rig.inside(held) and rig.usual_profile()
     except (BusError, ServoError):
         assert set(fate) - {""}
-    assert all(rig.inside(goal) for goal in rig.goals)
-    assert rig.fastest_deg_s < 1.15 * SPEED_DEG_S
+    assert all(rig.inside(goal) for goal in rig.goals) and rig.fastest_deg_s < 1.15 * SPEED_DEG_S
     rig.port.fate, rig.clock.t = iter(()), rig.clock.t + 0.3
     rig.start_up()  # by now perhaps inside, perhaps lost half way
     assert rig.inside(switched_on(rig.startups[0])) and rig.usual_profile()
@@ -133,8 +130,7 @@ def test_whoever_takes_the_torque_meanwhile_ends_it(model):
 @pytest.mark.parametrize("model", MODELS)
 def test_a_job_that_is_dropped_half_way_leaves_torque_off(model):
     rig = Rig(model, -12.0)
-    steps = rig.on_the_way()
-    steps.close()
+    rig.on_the_way().close()
     assert not rig.state(1)["torque"]
 
 
@@ -195,8 +191,7 @@ def test_enable_waits_for_it_and_says_so(caplog):
     assert rig.state(2)["position"] >= STORED["min_position_limit"]
     assert "joint2 (id 2) stands at 1200, outside its own limits 1300..2800: moving it inside at 20" in caplog.text
     readings = rig.ticks(held, 20)
-    assert readings["joint2"].fault is None
-    assert readings["joint2"].position_rad == pytest.approx(held[1], abs=0.01)
+    assert readings["joint2"].fault is None and readings["joint2"].position_rad == pytest.approx(held[1], abs=0.01)
 
 
 def test_torque_off_from_outside_ends_enable_with_torque_off():
@@ -230,8 +225,7 @@ def test_one_that_comes_back_outside_is_brought_in_beside_the_running_bus():
 
 def test_a_joint_outside_the_limits_of_the_head_is_told_with_its_angle_and_what_to_do(caplog):
     caplog.set_level(NOTE)
-    rig = plugged([EmulatedServo(1, start_ticks=4000)])
-    held = rig.hold()
+    held = plugged([EmulatedServo(1, start_ticks=4000)]).hold()
     (line,) = caplog.messages
     assert f"joint1 (id 1) stands at {math.degrees(held[0]):.1f} deg, outside its limits " in line
     assert "is moved back slowly" in line and "head calibrate" in line and "\n" not in line

@@ -62,8 +62,7 @@ REPLIES = [(1, 0, b"\x01\x02\xff\xff"), (7, 0x80, b"\xfd\x00\xff\xff"), (9, 0, b
 def test_fast_answer_that_stops_short_gives_those_in_front_of_the_gap(cut):
     whole = dxl2.encode_fast_status(REPLIES)
     got = dxl2.split_fast_status(whole[:cut], 4)
-    assert got == REPLIES[: len(got)]
-    assert len(got) == sum(8 + 8 * (k + 1) <= min(cut, len(whole)) for k in range(3))
+    assert got == REPLIES[: len(got)] and len(got) == sum(8 + 8 * (k + 1) <= min(cut, len(whole)) for k in range(3))
     if 8 <= cut < len(whole):  # what is damaged proves nothing behind it
         damaged = whole[:cut] + bytes([whole[cut] ^ 1]) + whole[cut + 1 :]
         assert dxl2.split_fast_status(damaged, 4) == REPLIES[: (cut - 8) // 8]

@@ -35,9 +35,7 @@ def test_bytes_go_out_and_come_in():
         port.write(b"abc")
         assert os.read(far, 10) == b"abc"
         os.write(far, b"defg")
-        assert port.read(3, 60.0) == b"def"
-        assert port.read(3, 60.0) == b"g"
-        assert port.read(3, 0.0) == b""
+        assert port.read(3, 60.0) == b"def" and port.read(3, 60.0) == b"g" and port.read(3, 0.0) == b""
         os.write(far, b"late")
         port.discard_input()
         assert port.read(9, 0.0) == b""
@@ -164,12 +162,10 @@ def looped():
 def test_where_there_is_no_descriptor_pyserial_is_asked():
     with looped() as port:
         io = serial_io(port, "loop")
-        assert isinstance(io, PolledIO)
-        assert io.read(9, 0.0) == b""
+        assert isinstance(io, PolledIO) and io.read(9, 0.0) == b""
         io.write(b"abcde")
         assert io.read(3, 60.0) == b"abc"  # as soon as there are any, never more than asked for
-        assert io.read(9, 60.0) == b"de"
-        assert io.read(9, 0.0) == b""
+        assert io.read(9, 60.0) == b"de" and io.read(9, 0.0) == b""
 
 
 def test_a_polled_device_that_is_gone_is_an_error_of_the_device():

@@ -54,12 +54,10 @@ def test_lengths_that_no_frame_has_are_refused_or_pass_where_a_parameter_is_the_
 @given(params, st.integers(1, 200))
 def test_frame_cut_off_does_not_swallow_the_next(data, cut):
     whole, part = encode(4, 0, b"\x01\x02"), encode(3, 0, data)
-    buffer = bytearray(part[: max(0, len(part) - cut)] + whole)
-    found = []
+    buffer, found = bytearray(part[: max(0, len(part) - cut)] + whole), []
     while (frame := take(buffer)) is not None:
         found.append(frame)
-    assert Frame(4, 0, b"\x01\x02") in found + salvage(buffer)
-    assert not buffer
+    assert Frame(4, 0, b"\x01\x02") in found + salvage(buffer) and not buffer
 
 
 @given(params, st.integers(0, 7), st.data())

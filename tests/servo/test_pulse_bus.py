@@ -58,8 +58,7 @@ def test_pulses_that_maestro_sends_already_are_kept_and_cost_no_wait():
     second.bus.connect()
     waits = len(second.port.waits)
     assert second.bus.enable(second.bus.joints) == pytest.approx([0.3, 0.2, 0.1, -0.4], abs=0.001)
-    assert second.pulses() == before
-    assert len(second.port.waits) == waits
+    assert second.pulses() == before and len(second.port.waits) == waits
 
 
 def test_what_did_not_change_is_sent_in_turn_only(bench):
@@ -135,8 +134,7 @@ def test_maestro_errors_become_faults_and_goals_are_sent_anew():
     bench.board.fail(maestro.TIMEOUT_ERROR, bench.clock.t)
     assert set(bench.pulses().values()) == {0}
     assert {r.fault for r in bench.ticks(held, 11).values()} == {"serial timeout"}
-    assert 0 not in bench.pulses().values()
-    assert {r.fault for r in bench.ticks(held, 11).values()} == {None}
+    assert 0 not in bench.pulses().values() and {r.fault for r in bench.ticks(held, 11).values()} == {None}
     assert bench.bus.statistics()["faults"] == ["face: serial timeout"]
 
 

@@ -149,8 +149,7 @@ def test_torque_off_anywhere_in_a_tick_is_the_last_word(at, model):
     bench.adapter.interrupt = lambda: bench.bus.torque_off("release")
     for k in range(200):
         bench.tick(held + 0.1 * math.sin(k / 5))
-    assert bench.adapter.interrupt is None
-    assert bench.on() == []
+    assert bench.adapter.interrupt is None and bench.on() == []
     bench.bus.stop("release")
     with pytest.raises(ValueError, match="no joint is enabled"):
         bench.tick(held)

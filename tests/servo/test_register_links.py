@@ -27,15 +27,12 @@ def link_of(model, starts, **more):
 def test_ping_tells_who_is_there_whatever_the_byte_order(model, found):
     link, _ = link_of(model, [500, 600])
     tool: RegisterLink = link
-    assert tool.ping(1) == found
-    assert tool.ping(9) is None
-    assert tool.broadcast_ping() == {1: found, 2: found}
+    assert tool.ping(1) == found and tool.ping(9) is None and tool.broadcast_ping() == {1: found, 2: found}
 
 
 def test_refusal_is_an_answer():
     link, _ = link_of("ax-12a", [512])
-    assert link.write(1, 36, b"\x00\x00") == Answer(0x08, b"")
-    assert link.read(1, 48, 20) == Answer(0x08, b"")
+    assert link.write(1, 36, b"\x00\x00") == Answer(0x08, b"") and link.read(1, 48, 20) == Answer(0x08, b"")
     newer, rig = link_of("xl330-m288", [2048])
     rig.port.device = Says(encode_status(1, ACCESS_ERROR))
     assert newer.read(1, 132, 4).error == ACCESS_ERROR
@@ -106,8 +103,7 @@ def test_own_words_heard_again_are_no_answer(model):
     position = rig.servo(1).table["present_position"]
     assert link.read(1, position.address, position.size) == Answer(0, position.to_bytes(500))
     rig.kill(1)
-    assert link.ping(1) is None
-    assert link.read(1, 36, 2) is None
+    assert link.ping(1) is None and link.read(1, 36, 2) is None
 
 
 @pytest.mark.parametrize("hears_itself", [False, True])

@@ -20,14 +20,12 @@ SERVOS = {table.model: table for table in (X, AX, MX, STS, SCS)}
 def test_every_register_takes_its_whole_range(register, data):
     field = register[0][register[1]]
     value = data.draw(st.integers(field.low, field.high))
-    assert len(field.to_bytes(value)) == field.size
-    assert field.from_bytes(field.to_bytes(value)) == value
+    assert len(field.to_bytes(value)) == field.size and field.from_bytes(field.to_bytes(value)) == value
 
 
 @given(st.sampled_from([(table, name) for table in SERVOS.values() for name in sorted(table.fields)]), st.binary())
 def test_whatever_a_servo_sends_has_a_value(register, data):
-    field = register[0][register[1]]
-    assert isinstance(field.from_bytes(data.ljust(4, b"\xff")), int)
+    assert isinstance(register[0][register[1]].from_bytes(data.ljust(4, b"\xff")), int)
 
 
 @pytest.mark.parametrize(
@@ -48,8 +46,7 @@ def test_whatever_a_servo_sends_has_a_value(register, data):
     ids=str,
 )
 def test_sign_rule_and_byte_order_are_the_models_own(table, name, value, raw):
-    assert table[name].to_bytes(value) == bytes.fromhex(raw)
-    assert table[name].from_bytes(bytes.fromhex(raw)) == value
+    assert table[name].to_bytes(value) == bytes.fromhex(raw) and table[name].from_bytes(bytes.fromhex(raw)) == value
 
 
 @pytest.mark.parametrize(
@@ -69,8 +66,7 @@ def test_table_survives_json(model):
 
 
 def test_faults_and_the_error_byte_name_what_is_the_servos():
-    assert X.fault_names(0) == ""
-    assert X.fault_names(0b100100) == "overheating, overload"
+    assert X.fault_names(0) == "" and X.fault_names(0b100100) == "overheating, overload"
     assert X.fault_names(0b10) == "hardware error bit 1"
     assert AX.status_fault_names(0b0110_0100) == "overheating, overload"
     assert AX.status_fault_names(0b0001_0000) == ""
@@ -98,8 +94,7 @@ def test_lock_until_power_off_is_not_the_lock_that_tools_open_and_close():
 
 def test_channels_speed_and_factory_baud_rate_are_read_from_the_map():
     assert (MAESTRO.channels, MAESTRO.tick_us, MAESTRO.protocol, MAESTRO.size) == (24, 0.25, None, 0)
-    assert MAESTRO.center_ticks * MAESTRO.tick_us == 1500.0
-    assert MAESTRO.role("present_position") is None
+    assert MAESTRO.center_ticks * MAESTRO.tick_us == 1500.0 and MAESTRO.role("present_position") is None
     unknown = Table.of(load_firmware_map("sts3032"))
     assert unknown.top_speed_ticks_s == pytest.approx(ASSUMED_SPEED_DEG_S * 4096 / 360)
     assert X.top_speed_ticks_s == pytest.approx(618 * 4096 / 360)

@@ -24,9 +24,8 @@ MEANT = {
     "query pulse": Query("QP", (5,)),
 }
 
-moves = st.dictionaries(
-    st.integers(0, 31), st.builds(Move, st.integers(500, 2500), st.integers(0, 65535)), min_size=1, max_size=32
-)
+move = st.builds(Move, st.integers(500, 2500), st.integers(0, 65535))
+moves = st.dictionaries(st.integers(0, 31), move, min_size=1, max_size=32)
 
 
 @pytest.mark.parametrize("name", BUILT)

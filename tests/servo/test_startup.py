@@ -52,8 +52,7 @@ class Rig(ServoRig):
 @pytest.mark.parametrize("model", MODELS)
 def test_absent_servos_do_not_stop_the_others(model):
     rig = Rig(model, {"id": 1}, {"id": 3}, wanted=[1, 2, 3, 4])
-    assert rig.start_up() == {0: 0, 2: 0}
-    assert switched_on(rig.startups[2]) == rig.table.center_ticks
+    assert rig.start_up() == {0: 0, 2: 0} and switched_on(rig.startups[2]) == rig.table.center_ticks
     assert [rig.held("torque_enable", i) for i in (1, 3)] == [0, 1]
     assert rig.clock.t < 2 * 3 * 2 * PATIENCE_S  # two absent, three pings each, with room for the others
 
@@ -145,8 +144,7 @@ def test_an_sts_offset_counts_with_its_own_sign():
 def test_the_one_turn_of_an_sts_that_counts_turns_is_shifted_by_its_offset_with_its_own_sign(shaft, offset):
     table = Table.of(load_firmware_map("sts3215"))
     values = {"present_position": shaft - offset, "homing_offset": offset, "phase": 28}
-    needs = JointNeeds(1462, 2634, stored={"homing_offset": offset})
-    assert contradictions(values, table, needs) == []
+    assert contradictions(values, table, JointNeeds(1462, 2634, stored={"homing_offset": offset})) == []
 
 
 # --- what acts by itself ----------------------------------------------------------------------------------------
@@ -179,8 +177,7 @@ def test_a_servo_as_it_leaves_the_factory_contradicts_nothing(model):
 def test_a_joint_turned_by_hand_past_one_turn_starts_where_it_stands(model, found):
     rig = Rig(model, {"start_ticks": found})
     rig.start_up()
-    assert switched_on(rig.startups[0]) == found % 4096
-    assert rig.held("torque_enable") == 1
+    assert switched_on(rig.startups[0]) == found % 4096 and rig.held("torque_enable") == 1
     assert rig.servo(1).state(rig.clock.t + 1.0)["position"] == found % 4096
 
 
@@ -271,5 +268,4 @@ def test_what_is_wanted_is_in_force_after_startup(model):
     rig.start_up()
     switched_on(rig.startups[0])
     wanted = rig.startups[0].wanted()
-    assert wanted
-    assert {name: rig.held(name) for name in wanted} == dict(wanted)
+    assert wanted and {name: rig.held(name) for name in wanted} == dict(wanted)

@@ -52,8 +52,7 @@ def test_joints_are_in_the_order_of_the_servos_nothing_goes_before_connect_and_n
 
 
 def test_bad_goal_is_refused_with_nothing_sent(rig):
-    goals = rig.hold()
-    mark = len(rig.sent)
+    goals, mark = rig.hold(), len(rig.sent)
     for bad in (math.nan, math.inf, -math.inf, LIMIT_RAD + 0.01, -LIMIT_RAD - 0.01):
         goals[-1] = bad
         with pytest.raises(ValueError, match=rig.bus.joints[-1]):
@@ -65,8 +64,7 @@ def test_bad_goal_is_refused_with_nothing_sent(rig):
 
 def test_torque_comes_on_without_a_jump_where_the_position_is_known(rig):
     rig.bus.connect()
-    before = rig.polls(2)
-    held = rig.bus.enable(rig.bus.joints)
+    before, held = rig.polls(2), rig.bus.enable(rig.bus.joints)
     assert np.isfinite(held).all()
     after = rig.polls(20, 0.05)
     if rig.tells("position"):
@@ -77,8 +75,7 @@ def test_torque_comes_on_without_a_jump_where_the_position_is_known(rig):
 def test_goal_is_reached(rig):
     held = rig.hold()
     goals = held - np.copysign(0.1, held)
-    moving = rig.ticks(goals, 2)
-    readings = rig.ticks(goals, 60)
+    moving, readings = rig.ticks(goals, 2), rig.ticks(goals, 60)
     if rig.tells("position"):
         assert [r.position_rad for r in readings.values()] == near(goals, rig)
         assert all(abs(r.extra["velocity_rad_s"]) > 0.1 for r in moving.values())
@@ -97,8 +94,7 @@ def test_nothing_is_reported_that_the_family_does_not_tell_and_statistics_have_t
         assert {TOLD[key] for key in reading.extra} <= told
     rig.ticks(held, 3)
     counts = rig.bus.statistics()
-    assert set(counts) >= STATISTICS
-    assert counts["silent"] == [] and counts["writes"] >= 1
+    assert set(counts) >= STATISTICS and counts["silent"] == [] and counts["writes"] >= 1
 
 
 def test_stop_may_be_called_at_any_time_and_again(rig):
@@ -132,13 +128,11 @@ def test_bus_connects_again_after_close(rig):
 @pytest.mark.emulated
 def test_goals_move_nothing_that_is_not_enabled(rig):
     rig.bus.connect()
-    held = rig.bus.enable(rig.bus.joints[:2])
-    before = rig.shafts_rad()
+    held, before = rig.bus.enable(rig.bus.joints[:2]), rig.shafts_rad()
     goals = np.zeros(4)
     goals[:2] = held
     rig.ticks(goals, 30)
-    assert rig.torques() == [True, True, False, False]
-    assert rig.shafts_rad()[2:] == pytest.approx(before[2:])
+    assert rig.torques() == [True, True, False, False] and rig.shafts_rad()[2:] == pytest.approx(before[2:])
 
 
 @pytest.mark.emulated
@@ -154,8 +148,7 @@ def test_release_takes_the_torque_away_and_hold_leaves_it(rig):
 def test_some_joints_are_released_while_the_others_go_on(rig):
     held = rig.hold()
     rig.ticks(held, 5)
-    gone = rig.bus.joints[0]
-    mark = len(rig.sent)
+    gone, mark = rig.bus.joints[0], len(rig.sent)
     rig.bus.release([gone])
     assert len(rig.sent) == mark + 1  # at once, in one packet
     goals = held.copy()
@@ -163,8 +156,7 @@ def test_some_joints_are_released_while_the_others_go_on(rig):
     for share in np.linspace(0, 1, 20):
         readings = rig.ticks(held + share * (goals - held), 1)
     rig.ticks(goals, 30)
-    assert rig.torques() == [False] + [True] * (len(rig.ids) - 1)
-    assert rig.shafts_rad()[1:] == near(goals[1:], rig)
+    assert rig.torques() == [False] + [True] * (len(rig.ids) - 1) and rig.shafts_rad()[1:] == near(goals[1:], rig)
     assert all(readings[joint].fault is None for joint in rig.bus.joints)  # nobody calls it a fault
     again = rig.bus.enable([gone])
     assert not rig.tells("position") or again == near(rig.shafts_rad()[:1], rig)
@@ -243,8 +235,7 @@ def test_dead_servo_leaves_the_others_fresh_and_its_own_reading_grows_old(rig, p
     assert np.diff(ages) == pytest.approx(0.02)
     assert rig.bus.statistics()["silent"] == [rig.ids[place]]
     rig.chain.revive(rig.ids[place])
-    assert rig.ticks(held, 150)[dead].age_s < 0.2
-    assert rig.bus.statistics()["silent"] == []
+    assert rig.ticks(held, 150)[dead].age_s < 0.2 and rig.bus.statistics()["silent"] == []
 
 
 @pytest.mark.emulated
@@ -317,8 +308,7 @@ def test_adapter_may_be_unplugged_and_come_back(rig):
         assert all(r.age_s < 0.2 and r.fault is None for r in readings.values())
     goals = held - np.copysign(0.1, held)
     rig.ticks(goals, 100)
-    assert rig.shafts_rad() == near(goals, rig)
-    assert all(rig.torques())
+    assert rig.shafts_rad() == near(goals, rig) and all(rig.torques())
 
 
 @pytest.mark.emulated

@@ -32,8 +32,7 @@ def test_any_number_of_silent_servos_costs_one_read_deadline_in_a_poll(family):
         rig.port.mute = dead
         worst_s, readings = most(rig, 120, held)
         assert worst_s <= healthy_s + READ_DEADLINE_S + 0.001 + SLACK_S
-        assert worst_s <= rig.bus._poll.budget_s + SLACK_S
-        assert rig.bus.statistics()["silent"] == sorted(dead)
+        assert worst_s <= rig.bus._poll.budget_s + SLACK_S and rig.bus.statistics()["silent"] == sorted(dead)
         assert all(readings[f"joint{i}"].age_s < 0.1 for i in rig.ids if i not in dead)
 
 
@@ -163,8 +162,7 @@ def test_torque_off_waits_for_nobody_and_no_goal_follows_it(family):
     assert rig.clock.t - began_s < 0.001
     rig.port.mute = set()
     rig.ticks(held + 0.1, 100)
-    assert rig.torques() == [0] * 8
-    assert rig.bus.enable(rig.bus.joints) == pytest.approx(held, abs=0.02)
+    assert rig.torques() == [0] * 8 and rig.bus.enable(rig.bus.joints) == pytest.approx(held, abs=0.02)
     rig.ticks(held, 5)
     assert rig.torques() == [1] * 8
 
@@ -194,8 +192,7 @@ def test_24_joints_come_back_in_many_ticks_and_the_watchdogs_of_4_that_hold_do_n
     bus.resume(bus.joints)
     assert clock.t == began_s
     ticks(250)
-    assert set(back) == set(face.bus.joints) and len(set(back.values())) > 8
-    assert max(back.values()) - began_s < 1.5
+    assert set(back) == set(face.bus.joints) and len(set(back.values())) > 8 and max(back.values()) - began_s < 1.5
     assert face.torques() == [1] * 24 and neck.torques() == [1] * 4 and bus.statistics()["faults"] == []
     assert np.diff(neck.port.sent_at_s[mark - 1 :]).max() < 0.03
 
@@ -226,8 +223,7 @@ def test_age_is_never_negative_and_a_servo_dead_since_connect_is_not_fresh(famil
     for _ in range(50):
         readings = rig.tick(held)
         assert all(reading.age_s >= 0.0 for reading in readings.values())
-    assert readings["joint4"].age_s >= rig.clock.t - began_s - 0.02
-    assert readings["joint1"].age_s < 0.05
+    assert readings["joint4"].age_s >= rig.clock.t - began_s - 0.02 and readings["joint1"].age_s < 0.05
 
 
 GENTLE = Safety(pinch=LoadRule(current_mA=200, for_s=0.1, then="limp"))
@@ -287,8 +283,7 @@ def test_torque_off_that_gets_lost_is_a_named_fault_and_is_repeated(family):
     assert "joint2: torque is not off" in rig.bus.statistics()["faults"]
     servo.write = write
     readings = rig.ticks(goals, 2)
-    assert rig.torques() == [1, 0, 1, 1]
-    assert rig.ticks(goals, 3)["joint2"].fault != "torque is not off"
+    assert rig.torques() == [1, 0, 1, 1] and rig.ticks(goals, 3)["joint2"].fault != "torque is not off"
 
 
 @pytest.mark.parametrize("family", TELLS_CURRENT)
@@ -311,8 +306,7 @@ def test_reduce_is_half_whatever_acknowledgements_are_lost(family):
 
 def test_watchdog_whose_first_write_is_lost_is_armed_all_the_same():
     rig = timed("dynamixel2", 4)
-    held = rig.hold()
-    servo = rig.port.device.servo(3)
+    held, servo = rig.hold(), rig.port.device.servo(3)
     write, address = servo.write, rig.family.table["bus_watchdog"].address
     servo.write = lambda at, data, now_s: 0 if at == address else write(at, data, now_s)
     rig.ticks(held, 5)
