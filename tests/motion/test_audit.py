@@ -49,8 +49,7 @@ def test_a_speed_acceleration_or_jerk_just_over_its_limit_is_a_violation(order):
     ))  # fmt: skip
     audit = CommandAudit(alone, Calibration(HEAD.joints, np.full(J, 4096)), DT_S)
     for share, found in ((0.9999, 0), (1.0001, 1)):
-        state = audit.start(np.zeros(J))
-        rise = bound * DT_S**order * share
+        state, rise = audit.start(np.zeros(J)), bound * DT_S**order * share
         state = audit.step(steps(jaw, [rise])[0], np.zeros(J), state)
         assert state.violations == found
 

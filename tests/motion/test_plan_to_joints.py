@@ -51,8 +51,7 @@ def test_a_nod_arrives_on_time_with_hardly_more_jerk_than_the_nod_itself(nods_hz
     _, sent = played(motions(110, pitch=nod(FRAME_S * np.arange(110))))
     pitch = sent[100:, PITCH]
     true = nod(TICK_S * np.arange(100, len(sent)) + PARTS.leads_s[PITCH])
-    assert np.abs(pitch - true).max() < np.radians(0.05)
-    assert rms_jerk(pitch) < 1.5 * rms_jerk(true)
+    assert np.abs(pitch - true).max() < np.radians(0.05) and rms_jerk(pitch) < 1.5 * rms_jerk(true)
 
 
 @pytest.mark.parametrize("closed_frames", [1, 2, 3])

@@ -100,9 +100,7 @@ def anywhere(rng, limits: JointLimits) -> np.ndarray:
 def asked(rng, limits: JointLimits, last, kind: str) -> np.ndarray:
     """A reference (3, J)."""
     width, still = limits.high - limits.low, np.zeros(len(last))
-    rates = (
-        rng.choice([-1.0, 0.0, 1.0], (2, len(last))) * rng.uniform(0, 2) * np.stack([limits.speed, limits.acceleration])
-    )
+    rates = rng.choice([-1.0, 0, 1], (2, len(last))) * rng.uniform(0, 2) * np.stack([limits.speed, limits.acceleration])
     if kind == "here, at speed":  # needs a run-up
         return np.stack([last + rng.normal(size=len(last)) * 1e-3, *rates])
     if kind == "outward":
@@ -147,14 +145,12 @@ def test_no_goal_is_refused_and_no_joint_goes_farther_out(name, size, chase, see
 @settings(max_examples=2)
 @given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))
 def test_every_joint_is_inside_its_range_in_the_stated_time_and_stays(name, size, chase, seed, kinds):
-    law = Law(size(load_head(name)), chase)
-    rng = np.random.default_rng(seed)
+    law, rng = Law(size(load_head(name)), chase), np.random.default_rng(seed)
     law.start(anywhere(rng, law.limits))
     everybody, latest_s = np.arange(law.count), law.due_s.max()
     before = np.zeros(law.count, bool)
     for _ in range(int(latest_s / DT_S) + 20):
-        reference = asked(rng, law.limits, law.last, kinds[rng.integers(len(kinds))])
-        inside = law.tick(reference, everybody)
+        inside = law.tick(asked(rng, law.limits, law.last, kinds[rng.integers(len(kinds))]), everybody)
         assert not (before & ~inside).any()
         before = inside
     assert before.all()
@@ -177,8 +173,7 @@ def test_braking_stops_every_joint_where_no_limit_is_broken_and_nobody_goes_fart
         law.audited = law.audit.step(goals, goals, law.audited)
         assert (goals >= low).all() and (goals <= high).all()
         law.last = goals
-    assert law.audited.violations == 0
-    assert np.array_equal(law.last, before)
+    assert law.audited.violations == 0 and np.array_equal(law.last, before)
     law.restart(np.ones(law.count, bool), law.last)  # and it goes on from there
     law.tick(asked(np.random.default_rng(seed), limits, law.last, "anywhere"), np.arange(law.count))
 

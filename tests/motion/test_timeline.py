@@ -46,8 +46,7 @@ def test_before_any_plan_the_face_is_neutral():
 
 
 def test_frames_are_met_at_their_times():
-    rng = np.random.default_rng(0)
-    frames = rng.uniform(0, 1, (12, MOTION_DIM)).astype(np.float32)
+    frames = np.random.default_rng(0).uniform(0, 1, (12, MOTION_DIM)).astype(np.float32)
     state = TIMELINE.accept(cut(frames, 3), TIMELINE.start())
     played = at(state, *(FRAME_S * np.arange(6, 12)), now_s=0.2)  # the first two are blended with neutral
     still = np.ones(MOTION_DIM, bool)
@@ -72,8 +71,7 @@ def test_a_nod_is_played_without_lag_or_added_jerk(lead_s):
     def nod(t):
         return np.radians(2.5) * np.sin(2 * np.pi * 2.0 * t)
 
-    frames = motions(120, pitch=nod(FRAME_S * np.arange(120)))
-    times, rows, _ = ran(frames, lead_s)
+    times, rows, _ = ran(motions(120, pitch=nod(FRAME_S * np.arange(120))), lead_s)
     played, true = rows[50:, PITCH].astype(np.float64), nod(times[50:])
     assert np.abs(played - true).max() < np.radians(0.002)
 
@@ -85,10 +83,8 @@ def test_a_nod_is_played_without_lag_or_added_jerk(lead_s):
 
 @pytest.mark.parametrize("phase_s", np.arange(0, FRAME_S, 0.003))
 def test_a_blink_of_one_frame_reaches_its_peak_at_a_tick_wherever_the_ticks_fall(phase_s):
-    frames = motions(30, eyeBlinkLeft=[1.0 if k == 15 else 0.0 for k in range(30)])
-    _, rows, _ = ran(frames, lead_s=phase_s)
-    assert rows[:, BLINK].max() == pytest.approx(1.0)
-    assert rows[:, BLINK].min() == 0.0
+    _, rows, _ = ran(motions(30, eyeBlinkLeft=[1.0 if k == 15 else 0.0 for k in range(30)]), lead_s=phase_s)
+    assert rows[:, BLINK].max() == pytest.approx(1.0) and rows[:, BLINK].min() == 0.0
 
 
 def test_a_face_beyond_its_range_is_played_at_the_end_of_it():
@@ -162,8 +158,7 @@ def test_without_plans_the_face_eases_to_neutral_and_the_next_plan_is_taken_up()
 
 
 def test_plans_of_one_frame_are_played_one_frame_late_and_move_the_face_however_late():
-    ramp = motions(40, pitch=0.01 * np.arange(40))
-    times, rows, state = ran(ramp, horizon=1, hop=1)
+    times, rows, state = ran(motions(40, pitch=0.01 * np.arange(40)), horizon=1, hop=1)
     assert rows[20:, PITCH] == pytest.approx(0.01 * (times[20:] / FRAME_S - 1), abs=1e-5)
     assert state.held == state.late == 0
     frames = motions(80, mouthSmileLeft=[k >= 20 for k in range(80)])

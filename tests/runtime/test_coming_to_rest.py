@@ -70,8 +70,7 @@ def ran(
     times: int = 1, observer: Watcher | None = None, interrupted: Any = lambda: False, limiter: Any = None,
 ) -> tuple[str, RunLog]:  # fmt: skip
     """One run on a fresh bus, in which `place` raises."""
-    motion = build_motion(HEAD, RATE_HZ)
-    bus = build_bus(HEAD, {"main": chain}, clock)
+    motion, bus = build_motion(HEAD, RATE_HZ), build_bus(HEAD, {"main": chain}, clock)
     bus.connect()
     log = RunLog(joints=list(HEAD.joints), period_s=1 / RATE_HZ, audit=motion.audit)
     parts: dict[str, Any] = {

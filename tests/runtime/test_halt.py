@@ -310,8 +310,7 @@ def test_a_folder_that_cannot_be_looked_into_any_more_halts(tmp_path: Path, then
 
 def test_a_line_of_a_gpio_chip_is_asked_for_as_the_kernel_wants_it() -> None:
     chip = Chip()
-    line = open_line("/dev/null", 17, ioctl=chip.ioctl)
-    assert (line.fd, chip.offset) == (chip.events, 17)
+    assert (open_line("/dev/null", 17, ioctl=chip.ioctl).fd, chip.offset) == (chip.events, 17)
     assert chip.flags == 0b1_0011_0110  # input, active low, both edges, pull-up
     open_line("/dev/null", 17, active_low=False, ioctl=chip.ioctl)
     assert chip.flags == 0b11_0100  # input, both edges

@@ -110,8 +110,7 @@ def test_a_halt_brakes_holds_the_neck_lets_go_of_the_rest_and_eases_in_when_it_i
     before = "starting" if halted < EASE_S * RATE_HZ else "listening"
     assert [ran.ticks[halted].state, ran.ticks[halted + 1].state] == [before, "halted"]
     assert ran.ticks[halted + 1].why == ("key",)
-    goals = ran.watcher.goals()
-    stop = halted + round(STOPS_S * RATE_HZ)
+    goals, stop = ran.watcher.goals(), halted + round(STOPS_S * RATE_HZ)
     assert np.array_equal(goals[stop], goals[late])  # stands, for as long as it is halted
     assert seen == {joint: joint in NECK for joint in JOINTS}
     assert "starting" in ran.states[ran.states.index("halted") :] and ran.states[-2:] == ["listening", "stopping"]
@@ -232,8 +231,7 @@ def test_a_head_that_lost_its_torque_because_the_loop_stood_still_comes_back_who
     ran = run(chain, does, seconds=6.0, latch=Late(), opened=buses.append)
     assert ran.outcome == "done" and ran.log.audited.violations == 0
     assert set(came_back(ran)) == set(JOINTS) and ran.states[-2:] == ["listening", "stopping"]
-    goals = ran.watcher.goals()
-    assert np.ptp(goals[-100:, JOINTS.index(NECK[1])]) > 0.05
+    assert np.ptp(ran.watcher.goals()[-100:, JOINTS.index(NECK[1])]) > 0.05
 
 
 def test_who_is_gone_is_not_answered_and_who_comes_is_answered_within_half_a_second(chain):
@@ -256,7 +254,6 @@ def test_a_hot_servo_moves_less_and_then_rests(chain):
 def test_the_source_is_told_how_fast_joints_move_and_that_they_stand_while_they_are_halted(chain):
     somebody = Somebody()
     ran = run(chain, lambda latch: {150: lambda: latch.close("key")}, seconds=3.0, source=somebody)
-    goals = ran.watcher.goals()
-    speeds = np.abs(np.diff(goals, axis=0)).sum(axis=1) * RATE_HZ
+    speeds = np.abs(np.diff(ran.watcher.goals(), axis=0)).sum(axis=1) * RATE_HZ
     assert np.allclose(somebody.told_rad_s[1:], speeds)
     assert max(speeds[100:150]) > 0.1 and set(somebody.told_rad_s[-50:]) == {0.0}

@@ -50,10 +50,8 @@ def assert_at_rest(chain: Chain) -> None:
 
 def test_a_run_ends_at_rest_without_torque_and_without_a_violation(chain: Chain) -> None:
     ran = run(chain, nodder())
-    assert ran.outcome == "done"
-    assert (ran.log.frames, ran.watcher.frames, ran.watcher.plans) == (50, 50, 13)
-    assert [tick.state for tick in ran.ticks].index("stopping") == 201
-    assert ran.log.audited.violations == 0
+    assert ran.outcome == "done" and (ran.log.frames, ran.watcher.frames, ran.watcher.plans) == (50, 50, 13)
+    assert [tick.state for tick in ran.ticks].index("stopping") == 201 and ran.log.audited.violations == 0
     assert_at_rest(chain)
 
 
@@ -62,22 +60,7 @@ def test_torque_comes_on_without_a_jump_and_the_face_eases_in(chain: Chain) -> N
     sagged = sagged_rad(HEAD.joints["neck_pitch"], sags=True)  # where the emulated head is found when switched on
     row = list(HEAD.joints).index("neck_pitch")
     assert ticks[0].goals_rad[row] == pytest.approx(sagged, abs=2e-3)
-    steps = np.abs(np.diff([tick.goals_rad[row] for tick in ticks[:20]]))
-    assert steps.max() < 0.005
-
-
-def test_a_joint_outside_its_limits_comes_in_from_where_it_stands(chain: Chain) -> None:
-    joint = HEAD.joints["neck_pitch"]
-    outside = joint.zero_ticks - 700  # 61 degrees back, the range ends at 30
-    chain.turn(joint.id, outside)
-    ran = run(chain, nodder())
-    row = list(HEAD.joints).index("neck_pitch")
-    pitches = ran.watcher.goals()[:, row]
-    assert pitches[0] == pytest.approx(-700 * 2 * np.pi / 4096, abs=2e-3)
-    assert np.abs(np.diff(pitches)).max() <= np.radians(150) / RATE_HZ * (1 + 1e-6)
-    assert pitches[-1] > joint.min_rad
-    assert ran.log.audited.violations == 0
-    assert_at_rest(chain)
+    assert np.abs(np.diff([tick.goals_rad[row] for tick in ticks[:20]])).max() < 0.005
 
 
 def test_the_head_follows_the_listener(chain: Chain) -> None:
@@ -86,28 +69,11 @@ def test_the_head_follows_the_listener(chain: Chain) -> None:
     assert max(p for p in pitches if p is not None) == pytest.approx(0.1, abs=0.01)
 
 
-def test_an_interruption_still_comes_to_rest(chain: Chain) -> None:
-    watcher = Watcher()
-    ran = run(chain, nodder(), watcher, interrupted=lambda: len(watcher.ticks) >= 130)
-    assert ran.outcome == "interrupted"
-    assert [tick.state for tick in ran.ticks].index("stopping") == 130
-    assert_at_rest(chain)
-
-
 def test_a_plan_that_is_not_finite_is_refused_and_the_face_stays_safe(chain: Chain) -> None:
     ran = run(chain, nodder(nan_from=20))
     assert ran.outcome == "done" and ran.log.refused_plans > 0
-    assert all(np.isfinite(tick.goals_rad).all() for tick in ran.ticks)
-    assert ran.log.audited.violations == 0
+    assert all(np.isfinite(tick.goals_rad).all() for tick in ran.ticks) and ran.log.audited.violations == 0
     assert_at_rest(chain)
-
-
-def test_a_servo_that_falls_silent_leaves_the_others_moving(chain: Chain) -> None:
-    ran = run(chain, nodder(), Watcher({50: lambda: chain.kill(4)}))
-    last = ran.ticks[-1].readings
-    assert ran.outcome == "done" and ran.statistics["silent"] == [4]
-    assert last["eye_tilt_right"].age_s > 1.0
-    assert last["neck_pitch"].age_s == 0.0
 
 
 def test_a_servo_that_refuses_torque_leaves_none_of_them_with_torque(chain: Chain) -> None:

@@ -56,8 +56,7 @@ def test_every_event_is_told_once_whatever_the_horizon(hop, horizon, seed):
     for kind, signal in signals.items():
         offline = [start for start, _, _ in detectors[kind](signal.astype(float), 25)]
         told = [event.start_s for event in heard if event.kind == kind]
-        assert len(told) == len(offline)
-        assert np.allclose(told, offline, atol=0.25)
+        assert len(told) == len(offline) and np.allclose(told, offline, atol=0.25)
 
 
 def test_a_gap_or_another_time_is_no_event_and_a_day_of_plans_takes_the_room_of_eight_seconds():
@@ -116,5 +115,4 @@ def test_what_a_listener_decides_is_told_as_it_is_and_motion_is_not_looked_at():
     found, motion = PlannedEvents(), np.zeros((8, MOTION_DIM), np.float32)
     motion[2:5, CHANNEL_INDEX["eyeBlinkLeft"]] = 1.0
     plan = Plan(0.04, 0.04 * np.arange(2, 10), motion, events=(nod,), hazards_hz={"nod": 0.1})
-    assert found.add(plan) == [nod]
-    assert found.add(replace(plan, made_at_s=0.12, events=())) == []
+    assert found.add(plan) == [nod] and found.add(replace(plan, made_at_s=0.12, events=())) == []

@@ -27,8 +27,7 @@ def run(chain: Chain, does: dict[int, Callable[[], None]], seconds: float) -> tu
 
 
 def test_joint_that_came_back_eases_in_from_where_it_stands():
-    pitch = JOINTS.index("neck_pitch")
-    servo = HEAD.joints["neck_pitch"].id
+    pitch, servo = JOINTS.index("neck_pitch"), HEAD.joints["neck_pitch"].id
     with launch(emulated(HEAD)["main"], virtual=True) as chain:
         does = {49: lambda: chain.kill(servo), 200: lambda: chain.revive(servo)}  # half way into its bow
         ran, ticks = run(chain, does, 6.0)
@@ -37,8 +36,7 @@ def test_joint_that_came_back_eases_in_from_where_it_stands():
     back = [k for k, tick in enumerate(ticks) if tick.readings["neck_pitch"].rejoined]
     assert len(back) == 1 and back[0] > 201
     bowed, stands = goals[200, pitch], ticks[back[0]].readings["neck_pitch"].position_rad
-    assert abs(bowed - stands) > 0.05
-    assert goals[back[0] + 1, pitch] == pytest.approx(stands, abs=0.003)
+    assert abs(bowed - stands) > 0.05 and goals[back[0] + 1, pitch] == pytest.approx(stands, abs=0.003)
     assert goals[-1, pitch] == pytest.approx(bowed, abs=0.003)
     others = np.delete(goals, pitch, axis=1)
     assert np.abs(np.diff(others[190:], axis=0)).max() < 1e-3  # they stood still all the while

@@ -19,8 +19,7 @@ RATE_HZ = 100.0
 
 def talkative(seconds, seed):
     """Head pitch, lids and smile with events at random, sampled at the rate of the loop."""
-    rng = np.random.default_rng(seed)
-    time_s = np.arange(0, seconds, 1 / RATE_HZ)
+    rng, time_s = np.random.default_rng(seed), np.arange(0, seconds, 1 / RATE_HZ)
     pitch, blink, smile = (np.zeros(len(time_s)) for _ in range(3))
     for start in np.arange(2.0, seconds - 3, 7.3) + rng.uniform(0, 3, len(np.arange(2.0, seconds - 3, 7.3))):
         inside = (time_s >= start) & (time_s < start + 1.2)

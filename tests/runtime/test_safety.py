@@ -80,8 +80,7 @@ def test_a_share_never_jumps_and_the_neck_goes_as_one(degrees: list[list[float]]
     for row in degrees:
         after = guard.after(guard.judge(np.array(row), heat), dt_s)
         assert np.abs(after.share - heat.share).max() <= safety.PER_S * dt_s + 1e-12
-        assert after.share[0] == after.share[2]
-        assert ((after.share >= 0) & (after.share <= 1)).all()
+        assert after.share[0] == after.share[2] and ((after.share >= 0) & (after.share <= 1)).all()
         heat = after
 
 

@@ -59,8 +59,7 @@ def test_only_arrows_of_the_table_are_taken_and_a_state_says_why(path, failed) -
 def test_the_page_on_safety_has_every_arrow_with_its_cause_and_its_longest_time() -> None:
     page = (Path(__file__).parents[2] / "docs" / "safety.md").read_text(encoding="utf-8")
     _, _, section = page.partition("## States of a run")
-    names = {name for arrow in ARROWS for name in arrow}
-    told = set()
+    names, told = {name for arrow in ARROWS for name in arrow}, set()
     for line in section.partition("\n## ")[0].splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) == 3 and " to " in cells[0]:
