@@ -15,7 +15,7 @@ from sfms_robot.errors import ConfigError, OutputError, PortError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, MOTION_DIM, SHAPES, ListenerEvent
 from sfms_robot.outputs.avatars import LARGEST_PACKET, LiveLinkOutput, VmcOutput, VmcSingleOutput
 from sfms_robot.outputs.json_stream import MOST_CLIENTS, MOST_RECEIVED, JsonStream, json_of
-from sfms_robot.outputs.registry import KINDS, open_output
+from sfms_robot.outputs.registry import open_output
 from sfms_robot.ports import OutputFrame
 from sfms_robot.sources.live_link import LiveLinkDecoder, parse_packet
 from sfms_robot.sources.vmc import VmcDecoder
@@ -23,8 +23,7 @@ from sfms_robot.sources.vmc import VmcDecoder
 
 def face(seed=0, turned=0.6):
     """Return a frame with every channel at work, but for positions, which avatars are not sent."""
-    rng = np.random.default_rng(seed)
-    motion = np.zeros(MOTION_DIM, np.float32)
+    rng, motion = np.random.default_rng(seed), np.zeros(MOTION_DIM, np.float32)
     motion[:3] = rng.uniform(-turned, turned, 3)
     motion[SHAPES] = rng.uniform(0, 1, len(BLENDSHAPES))
     return OutputFrame(time_s=12.34, motion=motion, state="listening")
@@ -70,21 +69,6 @@ def test_live_link_counts_frames_so_that_none_is_late_or_lost():
     for step in range(50):
         decoder.decode(output.packets(face(step), 7.0 + step / 50 + 0.015 * (step % 2))[0], step / 50)
     assert {decoder.statistics()[key] for key in ("lost", "late", "doubled")} == {0}
-
-
-@pytest.mark.parametrize("kind", ["vmc", "vmc-single", "live-link"])
-def test_packets_arrive_at_the_address(kind):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
-        receiver.bind(("127.0.0.1", 0))
-        receiver.settimeout(5)
-        output = open_output(f"{kind}:127.0.0.1:{receiver.getsockname()[1]}")
-        output.open()
-        output.send(face(), 0.0)
-        data = receiver.recv(65_536)
-        output.close()
-        output.close()
-    assert data.startswith({"vmc": b"#bundle", "vmc-single": b"/VMC/Ext/OK", "live-link": b"\x06"}[kind])
-    assert output.statistics()["bytes"] >= len(data)
 
 
 @pytest.mark.parametrize("kind", ["vmc", "live-link"])
@@ -187,10 +171,3 @@ def test_a_port_that_is_taken_or_not_one_is_refused_at_once(stream):
         JsonStream(port)
     with pytest.raises(ConfigError, match=r"^--output json:0.0.0.0:1: expected a TCP port of this machine .* got"):
         JsonStream("0.0.0.0:1")
-
-
-def test_every_shipped_kind_opens_by_its_name():
-    for kind in KINDS:
-        output = open_output(f"{kind}:0" if kind == "json" else kind)
-        assert output.kind == kind and output.rate_hz in (25, 50)
-        output.close()

@@ -26,9 +26,7 @@ from sfms_robot.ports import OutputFrame
 
 pytestmark = [pytest.mark.realtime, pytest.mark.slow]
 
-PROGRAM = os.environ.get(
-    "REACHY_MINI_DAEMON", Path(__file__).parents[2] / ".venv-reachy" / "bin" / "reachy-mini-daemon"
-)
+PROGRAM = os.environ.get("REACHY_MINI_DAEMON", Path(__file__).parents[2] / ".venv-reachy/bin/reachy-mini-daemon")
 OPTIONS = ["--mockup-sim", "--headless", "--no-media", "--no-preload-datasets", "--fastapi-port"]
 START_S = 120.0
 
@@ -135,8 +133,7 @@ def test_what_is_sent_is_reported_and_a_halt_holds_it(daemon):
     drive(sender, 0.5, lambda t: face_of(), state="halted")
     stopped = daemon.reported()[0]
     drive(sender, 1.0, lambda t: face_of(pitch=0.3), state="halted")
-    assert daemon.reported()[0] == pytest.approx(stopped, abs=1e-6)
-    assert stopped == pytest.approx(pose, abs=0.05)
+    assert daemon.reported()[0] == pytest.approx(stopped, abs=1e-6) and stopped == pytest.approx(pose, abs=0.05)
     drive(sender, 1.5, lambda t: face_of())
     finish(sender)
     assert daemon.reported()[0] == pytest.approx(np.eye(4), abs=5e-3)

@@ -18,12 +18,11 @@ from websockets.server import ServerProtocol
 from websockets.sync.server import serve
 
 from sfms_robot import load_head
-from sfms_robot.errors import ConfigError, OutputError
+from sfms_robot.errors import OutputError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, MOTION_DIM
 from sfms_robot.outputs import websocket_peer
 from sfms_robot.outputs.furhat import Furhat, params_of
 from sfms_robot.outputs.reachy_mini import ReachyMini, ReachyMiniOverlay, antennas, body_yaw, following, in_reach
-from sfms_robot.outputs.registry import open_outputs
 from sfms_robot.outputs.sender import MotionShaper
 from sfms_robot.outputs.vtube_studio import VtubeStudio, VtubeStudioAdd, inputs_of
 from sfms_robot.ports import OutputFrame
@@ -131,9 +130,7 @@ def answered(output, frame, now_s=0.0, opens=False, step_s=0.0):
 
 # --- Encoding ---------------------------------------------------------------------------------------------------------
 def test_antennas_and_body_move_as_those_of_the_shipped_head():
-    head = load_head("reachy_mini")
-    retargeter = HeadRetargeter(head)
-    rng = np.random.default_rng(0)
+    retargeter, rng = HeadRetargeter(load_head("reachy_mini")), np.random.default_rng(0)
     for _ in range(50):
         motion = motion_of(**dict(zip(CHANNELS[6:], rng.random(52), strict=True)), yaw=rng.uniform(-2.5, 2.5))
         angles = dict(zip(retargeter.joints, retargeter.angles(motion), strict=True))
@@ -143,8 +140,7 @@ def test_antennas_and_body_move_as_those_of_the_shipped_head():
 
 def test_every_pose_that_is_sent_is_within_reach_of_the_legs():
     neck = HeadRetargeter(load_head("reachy_mini")).neck
-    rng = np.random.default_rng(1)
-    wanted = rng.uniform(-1, 1, (2000, 6)) * [0.7, 0.7, 0.7, 0.02, 0.02, 0.02]
+    wanted = np.random.default_rng(1).uniform(-1, 1, (2000, 6)) * [0.7, 0.7, 0.7, 0.02, 0.02, 0.02]
     assert neck.reachable(np.array([in_reach(pose) for pose in wanted])).all()
     assert in_reach(np.array([0.1, 0.2, 1.0, 0.001, 0, 0])) == pytest.approx([0.1, 0.2, 1.0, 0.001, 0, 0])
 
@@ -177,20 +173,6 @@ def test_vtube_studio_gets_degrees_and_shares_that_are_0_for_a_neutral_face_in_t
     moved = inputs_of(motion_of(yaw=0.5, pitch=0.1, eyeBlinkLeft=1, mouthSmileLeft=1, mouthSmileRight=1))
     assert (moved["FaceAngleX"], moved["FaceAngleY"]) == (pytest.approx(28.648, abs=1e-3), pytest.approx(-5.73, 1e-3))
     assert (moved["EyeOpenLeft"], moved["EyeOpenRight"], moved["MouthSmile"]) == (0.0, 1.0, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("plain", "kind"),
-    [
-        ("reachy-mini", "reachy-mini-overlay"),
-        ("vtube-studio", "vtube-studio-add"),
-        ("vmc", "vmc-single"),
-        ("vmc", "vmc"),
-    ],
-)
-def test_one_program_gets_one_output(plain, kind):
-    with pytest.raises(ConfigError, match=f"--output {kind}: 127.0.0.1:.* gets {plain} already"):
-        open_outputs([plain, kind])
 
 
 # --- What moves a machine ---------------------------------------------------------------------------------------------

@@ -106,24 +106,21 @@ def test_the_offset_is_gone_after_3_s_whatever_the_first_face_did(pose, seed):
     faces = [motion(np.add(pose, random.normal(0, 0.01, 3)), jawOpen=0.1) for _ in range(60)]
     faces[0] = motion(np.add(pose, 0.4), jawOpen=0.1, mouthSmileLeft=0.9)
     out, _ = follow(faces)
-    assert np.abs(out[30:, :3]).max() < 0.08
-    assert out[30:, JAW].max() < 0.02
+    assert np.abs(out[30:, :3]).max() < 0.08 and out[30:, JAW].max() < 0.02
 
 
 def test_straight_ahead_is_found_again_after_the_camera_was_moved():
     _, state = follow([motion((0, 0, 0))] * 200 * HZ)
     assert state.samples.shape == (240, MOTION_DIM)  # the memory is bounded
     out, _ = follow([motion((0, 0.2, 0.5))] * 80 * HZ, 200, state)
-    assert abs(out[0][2]) > 0.4
-    assert np.abs(out[-1][:3]).max() < 0.01
+    assert abs(out[0][2]) > 0.4 and np.abs(out[-1][:3]).max() < 0.01
 
 
 @pytest.mark.parametrize("seconds", [1, 10, 50])
 def test_less_than_a_minute_of_an_expression_stays_one(seconds):
     _, state = follow([motion((0.1, 0, 0), mouthSmileLeft=0.1)] * 120 * HZ)
     out, _ = follow([motion((0.1, 0, 0.5), mouthSmileLeft=0.6)] * seconds * HZ, 120, state)
-    assert out[:, SMILE] == pytest.approx((0.6 - 0.1) / 0.9, abs=1e-5)
-    assert out[:, 2].min() > 0.45
+    assert out[:, SMILE] == pytest.approx((0.6 - 0.1) / 0.9, abs=1e-5) and out[:, 2].min() > 0.45
 
 
 def test_a_held_expression_never_vanishes():
@@ -147,8 +144,7 @@ def test_pose_and_place_are_seen_from_the_resting_ones():
 def test_a_face_that_comes_back_is_known_unless_it_was_away_for_10_s(away_s, yaw):
     _, state = follow([motion((0, 0, 0))] * 60 * HZ)
     out, state = follow([motion((0, 0, 0.5))] * 10, 60 + away_s, state)
-    assert out[0][2] == pytest.approx(yaw, abs=1e-4)
-    assert (len(state.samples) < 5) == (yaw == 0.0)
+    assert out[0][2] == pytest.approx(yaw, abs=1e-4) and (len(state.samples) < 5) == (yaw == 0.0)
 
 
 @given(st.lists(st.tuples(st.floats(-3, 3), st.floats(0, 1), st.floats(0, 30)), min_size=1, max_size=40))
@@ -159,8 +155,7 @@ def test_the_result_is_a_face(faces):
         given_face = np.full(MOTION_DIM, value, np.float32)
         given_face[POSE] = angle
         out = state.relative(given_face, time_s)
-        assert np.isfinite(out).all()
-        assert out[SHAPES].min() >= 0 and out[SHAPES].max() <= 1
+        assert np.isfinite(out).all() and out[SHAPES].min() >= 0 and out[SHAPES].max() <= 1
 
 
 def test_the_strongest_blink_since_the_last_question_is_seen():
@@ -263,8 +258,7 @@ def test_a_silent_sender_is_lost_after_half_a_second_until_it_is_back(sight):
     for frame in range(25, 51):
         sight.at(frame * 0.04)
         lost.append(sight.lost)
-    assert lost == [frame * 0.04 - 1.0 > live.LOST_S for frame in range(25, 51)]
-    assert 0.5 <= live.LOST_S <= 0.6
+    assert lost == [frame * 0.04 - 1.0 > live.LOST_S for frame in range(25, 51)] and 0.5 <= live.LOST_S <= 0.6
     feed(sight, FIRST, 2.05)
     sight.at(2.08)
     assert not sight.lost
@@ -286,15 +280,13 @@ def test_the_newest_face_of_an_instant_or_before_is_seen(sight):
     sight.start(10.0)
     for place, data in enumerate((b"\x00", b"\x0a", b"\x14")):
         feed(sight, FIRST, 10.0 + place * 0.01, data=data)
-    assert sight.at(-0.1) is None
-    assert sight.at(0.012).face.time_s == pytest.approx(0.01)
+    assert sight.at(-0.1) is None and sight.at(0.012).face.time_s == pytest.approx(0.01)
     assert sight.at(9.0).face.time_s == pytest.approx(0.02)
 
 
 def test_times_go_forward_whatever_the_wall_clock_does(sight):
     feed(sight, FIRST, 1.0, 0.5)
-    assert sight.at(0.9) is None
-    assert sight.at(1.0).face.time_s == 1.0
+    assert sight.at(0.9) is None and sight.at(1.0).face.time_s == 1.0
 
 
 def test_a_flood_is_read_in_parts_and_the_newest_faces_are_kept(sight):
@@ -308,8 +300,7 @@ def test_a_flood_is_read_in_parts_and_the_newest_faces_are_kept(sight):
     assert all(0 < after - before <= live.PACKETS_PER_CALL for before, after in zip(counts, counts[1:], strict=False))
     sender, first_s = sight._sender, sight._heard_s + 1.0
     feed(sight, sender, *(first_s + np.arange(1000) * 0.02))
-    assert sight.at(first_s + (999 - 256) * 0.02) is None
-    assert sight.at(first_s + (999 - 255) * 0.02) is not None
+    assert sight.at(first_s + (999 - 256) * 0.02) is None and sight.at(first_s + (999 - 255) * 0.02) is not None
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux says when a datagram came in")

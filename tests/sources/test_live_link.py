@@ -185,8 +185,7 @@ def test_a_program_that_does_not_count_is_seen_and_a_packet_without_a_face_shows
     decoder = LiveLinkDecoder()
     for number, value in enumerate(values):
         assert decoder.decode(packet(0, (value,) * 61), number / 60) is not None
-    assert decoder.remark() is None
-    assert decoder.decode(packet(1, values=()), 1.0) is None
+    assert decoder.remark() is None and decoder.decode(packet(1, values=()), 1.0) is None
     counted = decoder.statistics()
     assert (counted["doubled"], counted["lost"], counted["no_face"]) == (0, 0, 1)
 
@@ -209,8 +208,7 @@ def test_an_emulated_phone_is_seen(sight):
     assert sight.statistics()["faces"] == 0  # its units are not decided yet
     sight.feed(Datagram(renumbered(PACKETS[10], 2**20), sight._sender, sight._heard_s + 1.0))
     face = sight.at(1e9).face
-    assert face.time_s > 0
-    assert face.blendshapes.max() <= motion_of(parse_packet(PACKETS[10]).values)[SHAPES].max()
+    assert face.time_s > 0 and face.blendshapes.max() <= motion_of(parse_packet(PACKETS[10]).values)[SHAPES].max()
     assert sight.statistics()["faces"] == 1 and sight.statistics()["lost"] == 0
 
 
@@ -227,8 +225,7 @@ def test_head_angles_are_radians_or_degrees_as_the_first_second_says(sight, fact
 
 
 def test_pose_channels_are_flipped_on_request():
-    values = np.zeros(61, np.float32)
-    poses = {}
+    values, poses = np.zeros(61, np.float32), {}
     for flip in ("", ",flip=yaw+roll"):
         opened = open_live_link(f"127.0.0.1:{free_udp_port()}{flip}")
         opened.feed(Datagram(packet(1, values), ("192.0.2.1", 1), 0.0))

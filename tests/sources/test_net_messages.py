@@ -112,7 +112,7 @@ def parses(data):
         return None
 
 
-@pytest.mark.parametrize("count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [20_000, pytest.param(300_000, marks=pytest.mark.slow)])
 def test_random_messages_raise_nothing_else_and_what_is_read_is_finite(count):
     rng, read = np.random.default_rng(count), 0
     good = [
@@ -138,8 +138,7 @@ def test_a_senders_clock_is_never_early_and_late_by_the_quickest_way(origin_s, d
         clock.observe(sent_s, true_s + delay_s)
         late_s = sent_s + clock.offset_s - true_s
         assert late_s >= -20.0 * abs(drift)
-        recent = delays_s[max(0, index - 190) : index + 1]
-        assert late_s <= min(recent) + 20.0 * abs(drift) + 1e-6
+        assert late_s <= min(delays_s[max(0, index - 190) : index + 1]) + 20.0 * abs(drift) + 1e-6
 
 
 @pytest.mark.parametrize("step_s", [3600.0, -3600.0])

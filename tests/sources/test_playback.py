@@ -85,11 +85,9 @@ def test_a_device_that_drifts_is_followed(rate_hz, ppm):
     device = VirtualDevice(rate_hz, ppm)
     device.playout.start(ORIGIN_S)
     device.play(30.0)
-    assert device.off_s(after_s=0.1) < 0.004
-    assert device.off_s(after_s=15.0) < 0.0005
+    assert device.off_s(after_s=0.1) < 0.004 and device.off_s(after_s=15.0) < 0.0005
     told = device.playout.statistics()
-    assert (told["underruns"], told["jumps"]) == (0, 0)
-    assert told["drift_ppm"] == pytest.approx(ppm, abs=10)
+    assert (told["underruns"], told["jumps"]) == (0, 0) and told["drift_ppm"] == pytest.approx(ppm, abs=10)
     assert [silence.first for silence in device.playout.silences] == []
 
 
@@ -100,8 +98,7 @@ def test_stamps_that_come_late_change_little(seed, latency_s):
     device.play(0.0)  # a device runs before the loop does
     device.playout.start(ORIGIN_S)
     device.play(6.0)
-    assert device.off_s(after_s=0.0) < 0.002
-    assert device.playout.statistics()["jumps"] == 0
+    assert device.off_s(after_s=0.0) < 0.002 and device.playout.statistics()["jumps"] == 0
 
 
 def test_what_is_due_before_a_late_start_or_told_too_late_or_before_the_loop_begins_is_silence():
@@ -114,14 +111,12 @@ def test_what_is_due_before_a_late_start_or_told_too_late_or_before_the_loop_beg
     device = VirtualDevice(16_000, latency_s=0.06)
     device.playout.start(ORIGIN_S)
     device.play(1.0, ahead_s=FRAME_S)  # of a frame of 40 ms the device wants the end 60 ms before it leaves
-    silent = sum(each.last - each.first for each in device.playout.silences)
-    assert silent > 0.5 * AUDIO_HZ
+    assert sum(each.last - each.first for each in device.playout.silences) > 0.5 * AUDIO_HZ
     playout = Playout(16_000)
     playout.tell(0, np.ones(FRAME_SAMPLES, np.float32))
     assert not playout.block(160, 5.0).any()
     playout.start(6.0)
-    assert not playout.block(160, 5.01).any()
-    assert not playout.silences
+    assert not playout.block(160, 5.01).any() and not playout.silences
 
 
 @given(for_s=st.floats(0.005, 2.0), says_so=st.booleans())
@@ -138,8 +133,7 @@ def test_a_device_that_ran_dry_was_silent_and_is_on_time_again(for_s, says_so):
     (silence,) = device.playout.silences
     assert silence.first / AUDIO_HZ == pytest.approx(ended_s, abs=0.001)
     assert (silence.last - silence.first) / AUDIO_HZ == pytest.approx(for_s, abs=0.001)
-    assert device.off_s(after_s=0.0) < 0.001
-    assert device.playout.statistics()["underruns"] == 1
+    assert device.off_s(after_s=0.0) < 0.001 and device.playout.statistics()["underruns"] == 1
 
 
 def test_a_stream_that_is_far_off_jumps_to_its_place():
@@ -150,8 +144,7 @@ def test_a_stream_that_is_far_off_jumps_to_its_place():
     device.play(2.0)
     wrong_s = 0.0
     device.play(6.0)
-    assert device.playout.statistics()["jumps"] == 1
-    assert device.off_s(after_s=4.0) < 0.001
+    assert device.playout.statistics()["jumps"] == 1 and device.off_s(after_s=4.0) < 0.001
 
 
 def test_in_silence_it_is_put_right_at_once():
@@ -251,8 +244,7 @@ def talk():
     """Return speech that a program pushes, in the desk's time, and the desk."""
     clock = []
     spoken = PushedSpeech(lambda: clock[0].now_s)
-    desk = Desk(spoken, clock=clock)
-    return spoken, desk
+    return spoken, Desk(spoken, clock=clock)
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.1])
@@ -302,8 +294,7 @@ def test_a_hush_is_heard_as_soon_as_the_device_can_and_the_next_sentence_after_i
     hushed = round(desk.loop_s * AUDIO_HZ)
     desk.until(2.0)
     silent = hushed + round((LATENCY_S + HUSH_S + 0.006) * AUDIO_HZ)
-    assert np.abs(desk.left[hushed:silent]).max() > 0.2
-    assert not desk.left[silent + 40 :].any()
+    assert np.abs(desk.left[hushed:silent]).max() > 0.2 and not desk.left[silent + 40 :].any()
     again = noise(0.3, 1)
     spoken.say(again, AUDIO_HZ)
     begins = round((desk.loop_s + FRAME_S + desk.voice.delay_s) * AUDIO_HZ)
@@ -318,12 +309,10 @@ def test_a_device_that_runs_dry_is_a_silence_that_is_told_and_counted(caplog):
     desk = Desk(RecordedVoice(said)).until(1.0)
     desk.loudspeaker.device.starve(0.2)
     desk.until(2.5)
-    told = desk.voice.statistics()
-    assert told["unsaid_ms"] == pytest.approx(200.0, abs=1.0)
+    assert desk.voice.statistics()["unsaid_ms"] == pytest.approx(200.0, abs=1.0)
     (line,) = [record.getMessage() for record in caplog.records]
     assert line == "loudspeaker: virtual had nothing to play for 200 ms while the robot spoke (said once)"
-    on_time = round(1.5 * AUDIO_HZ)
-    begins = round(desk.voice.delay_s * AUDIO_HZ)
+    on_time, begins = round(1.5 * AUDIO_HZ), round(desk.voice.delay_s * AUDIO_HZ)
     np.testing.assert_allclose(desk.left[on_time:], said[on_time - begins :][: len(desk.left) - on_time], atol=1e-4)
     np.testing.assert_allclose(desk.taken[on_time:], desk.left[on_time:], atol=1e-4)
     assert not desk.left[round(1.061 * AUDIO_HZ) : round(1.259 * AUDIO_HZ)].any()
@@ -341,8 +330,7 @@ def test_where_nobody_hears_it_the_robot_says_nothing():
 def test_threads_that_speak_and_hush_do_not_hold_up_the_loop():
     """All of them for a thousand turns: nothing is raised, and the loop has its frames."""
     spoken = PushedSpeech()
-    loudspeaker = VirtualLoudspeaker()
-    voice = PlayedVoice(loudspeaker, spoken)
+    voice = PlayedVoice(VirtualLoudspeaker(), spoken)
     spoken.played_by(voice)
     voice.start(time.monotonic())
     over = threading.Event()
@@ -391,6 +379,5 @@ def test_the_echo_canceller_is_told_every_frame_and_a_little_early():
     first, told = sent[-1].first, sent[-1].said
     early = round(EARLY_S * AUDIO_HZ)
     assert early + ECHO_LATENCY_SAMPLES <= FRAME_SAMPLES
-    np.testing.assert_allclose(
-        told[:-early], desk.left[first * FRAME_SAMPLES + early :][: len(told) - early], atol=1e-5
-    )
+    left = desk.left[first * FRAME_SAMPLES + early :][: len(told) - early]
+    np.testing.assert_allclose(told[:-early], left, atol=1e-5)

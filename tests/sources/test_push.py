@@ -41,8 +41,7 @@ def heard(frames):
 def test_pieces_of_any_length_are_heard_whole_and_in_order(rate_hz, piece_s, jitter_s):
     """A ramp comes out as a ramp, however long and how unevenly its pieces come."""
     person, frames = Person(), []
-    rng = np.random.default_rng(1)
-    n = round(rate_hz * piece_s)
+    rng, n = np.random.default_rng(1), round(rate_hz * piece_s)
     for index in range(round(6.0 / piece_s)):
         frames += person.read((index + 1) * piece_s + rng.uniform(0, jitter_s))
         person.voice.hear((index * n + np.arange(n)) / rate_hz / 10, rate_hz)
@@ -72,8 +71,7 @@ def test_the_grid_never_slips_and_every_frame_is_whole_or_empty(moves):
 
 
 def test_bytes_integers_floats_and_channels_mean_the_same():
-    pcm = (np.sin(np.arange(3200) / 9) * 9000).astype(np.int16)
-    outs = []
+    pcm, outs = (np.sin(np.arange(3200) / 9) * 9000).astype(np.int16), []
     two = np.stack([pcm, pcm], axis=1)
     data, full = pcm.tobytes(), pcm / 32768
     ways = (data, bytearray(data), memoryview(data), pcm, full, full.tolist(), two, two.T, full[None])
@@ -153,8 +151,7 @@ def test_bursts_are_named_and_then_heard_whole(caplog):
         for piece in range(20):
             person.voice.hear((burst * 6400 + piece * 320 + np.arange(320)) / 250_000, 16000)
     sound = heard(frames[125:])
-    assert len(sound) == 640 * len(frames[125:])
-    assert np.diff(sound) == pytest.approx(1 / 250_000, abs=1e-5)
+    assert len(sound) == 640 * len(frames[125:]) and np.diff(sound) == pytest.approx(1 / 250_000, abs=1e-5)
     (said,) = caplog.records
     assert said.getMessage().startswith("hear(): sound comes in bursts, up to 400 ms apart")
 
@@ -302,8 +299,7 @@ def test_a_voice_with_times_is_placed_by_them():
 
 
 def test_calls_may_come_from_any_thread():
-    person = Person()
-    raised = []
+    person, raised = Person(), []
 
     def speak() -> None:
         try:

@@ -102,8 +102,7 @@ def found(part, whole):
 def test_what_is_played_is_what_is_heard(hear, play, tmp_path):
     said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 3 * AUDIO_HZ]
     soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
-    hearing = hear("mic:person")
-    player = play("person", tmp_path / "said.wav")
+    hearing, player = hear("mic:person"), play("person", tmp_path / "said.wav")
     hearing.until(lambda: player.poll() is not None)
     hearing.seconds(0.4)
     frames = hearing.frames
@@ -189,8 +188,7 @@ def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_ser
         player.wait()
         ear.source.close()
         hearing.source.close()
-    assert levels[0] > -40.0
-    assert levels[1] < levels[0] - 15.0
+    assert levels[0] > -40.0 and levels[1] < levels[0] - 15.0
     assert any(frame.agent_audio is not None and frame.agent_audio.any() for frame in frames)
 
 
@@ -202,11 +200,8 @@ def test_a_loudspeaker_is_heard_without_a_microphone_too(sound_server):
 
 
 def test_a_device_that_is_not_there_is_one_line_with_the_choices(sound_server):
-    assert [device.label for device in sound_devices() if "hw:" not in device.name] == [
-        "0 pulse",
-        "1 default",
-        "person.monitor",
-    ]
+    labels = [device.label for device in sound_devices() if "hw:" not in device.name]
+    assert labels == ["0 pulse", "1 default", "person.monitor"]
     for wanted, problem in (("nobody", "no such device"), ("7", "no such device"), ("p", "fits several devices")):
         with pytest.raises(ConfigError, match=f"--audio mic:{wanted}: {problem} .*person.monitor") as raised:
             open_microphone(wanted)
@@ -314,5 +309,4 @@ def test_what_it_plays_is_taken_out_of_what_it_hears(sound_server, tmp_path):
         for parts in ([frame.audio for frame in settled], [frame.agent_audio for frame in settled])
     )
     # Frame by frame: on a busy computer the sound server drops some, and the canceller needs a moment after each.
-    assert np.median(own) > -40.0
-    assert np.median(heard) < np.median(own) - 15.0
+    assert np.median(own) > -40.0 and np.median(heard) < np.median(own) - 15.0

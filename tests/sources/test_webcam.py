@@ -52,10 +52,8 @@ def test_the_newest_face_since_the_start_at_or_before_is_seen_however_old(camera
     looking = camera(seen(-0.5), seen(0.02), seen(0.05), seen(0.09))
     assert looking.at(0.0) is None and looking.latency_s == 0.0
     looking.start(ORIGIN_S)
-    assert looking.at(0.01) is None
-    assert looking.at(0.04).face.time_s == pytest.approx(0.02)
-    assert looking.at(0.1).face.time_s == pytest.approx(0.09)
-    assert looking.at(5.0).face.time_s == pytest.approx(0.09)
+    assert looking.at(0.01) is None and looking.at(0.04).face.time_s == pytest.approx(0.02)
+    assert looking.at(0.1).face.time_s == pytest.approx(0.09) and looking.at(5.0).face.time_s == pytest.approx(0.09)
     np.testing.assert_array_equal(looking.at(5.0).place_m, PLACE_M)
     assert looking.at(5.0).attention is None
     assert looking.latency_s == pytest.approx(0.02) and looking.statistics()["pictures"] == 3
@@ -111,8 +109,7 @@ def test_a_camera_that_gives_no_more_pictures_went_away_and_a_video_waits_for_it
 
 def test_a_worker_says_what_it_opened_and_waits_to_be_told_when_to_begin(grey_video):
     work = camera_source.watch(grey_video)
-    assert next(work) == camera_source.WebcamOpened(0.5)
-    assert work.send(None) is None
+    assert next(work) == camera_source.WebcamOpened(0.5) and work.send(None) is None
     first = work.send(time.monotonic())
     while first is None:
         first = work.send(None)

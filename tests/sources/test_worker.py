@@ -82,8 +82,7 @@ def first_of(worker, now_s):
 
 def test_values_come_in_their_order_and_a_worker_that_returns_is_not_started_again(start):
     worker = start(counts, 5)
-    assert until(worker, "finished") == [0, 1, 2, 3, 4]
-    assert worker.messages(1e9) == [] and not worker.lost
+    assert until(worker, "finished") == [0, 1, 2, 3, 4] and worker.messages(1e9) == [] and not worker.lost
     assert worker.statistics() == {"state": "finished", "restarts": 0, "dropped": 0}
 
 
@@ -126,6 +125,5 @@ def test_a_silent_worker_is_named_once_and_started_again_with_the_newest_message
 
 
 def test_a_worker_that_breaks_is_reported(start, caplog):
-    worker = start(breaks, "born")
-    assert until(worker, "lost") == ["born"]
+    assert until(start(breaks, "born"), "lost") == ["born"]
     assert "test: ZeroDivisionError: of a library; restarting" in caplog.text
