@@ -44,6 +44,5 @@ def test_no_samples_are_silence_not_heard(samples):
 
 @pytest.mark.parametrize("samples", [1, 639, 640, 641, 2000])
 def test_a_frame_of_the_agent_is_cut_or_filled_up(samples: int):
-    given = np.full(samples, 0.5, np.float32)
-    fitted = audio_frontend.fit_frame(given)
+    fitted = audio_frontend.fit_frame(np.full(samples, 0.5, np.float32))
     assert len(fitted) == FRAME_SAMPLES and fitted.sum() == 0.5 * min(samples, FRAME_SAMPLES)

@@ -78,8 +78,7 @@ def rolled(listener, streams, frames=9):
 def test_nothing_of_a_step_is_made_on_the_cpu(kind):
     listener = on(LISTENERS[kind](), RecordingEngine)
     rolled(listener, 3)
-    examples = listener.engine.examples
-    model = listener.model.to("meta")
+    examples, model = listener.engine.examples, listener.model.to("meta")
     for name, network in networks_of(model).items():
         inputs = [each.to("meta") for each in examples[name].values()]
         with torch.inference_mode():
@@ -122,10 +121,8 @@ def test_a_batch_that_was_too_large_comes_in_halves_and_one_such_stream_joins_ag
     server = StreamServer(Counting(), "counting")
     for client in "abcdef":
         server.receive(joined(server, client), frame(0), 0.0)
-    batch = server.batch()
-    server.too_many(batch)
-    assert server.heads == 6
-    assert len(server.batch()) == 3
+    server.too_many(server.batch())
+    assert server.heads == 6 and len(server.batch()) == 3
     server = StreamServer(Counting(), "counting")
     server.receive(joined(server, "a"), frame(0), 0.0)
     server.too_many(server.batch())

@@ -16,8 +16,7 @@ ASSETS = Path(__file__).parents[1] / "assets"
 @torch.no_grad()
 def sfms() -> dict[str, np.ndarray]:
     listener, drawn = tiny_listener(), torch.Generator().manual_seed(5)
-    model = listener.model
-    tokens = torch.randint(0, 7, (1, 48, 2), generator=drawn)
+    model, tokens = listener.model, torch.randint(0, 7, (1, 48, 2), generator=drawn)
     seen = Context(
         face=torch.randn(1, 40, 58, generator=drawn),
         face_known=torch.rand(1, 40, generator=drawn) > 0.3,

@@ -129,8 +129,7 @@ def test_interfaces_fit_whatever_the_version_and_words_of_a_later_protocol_are_r
     assert not messages.OURS.fits(replace(messages.OURS, frame_hz=30))
     told = json.loads(messages.words_message(messages.Join("a", 0)))
     told["interface"] |= {"protocol": 7, "colour": "red"}
-    said = messages.parse_words(json.dumps(told).encode())
-    assert said.interface.protocol == 7
+    assert messages.parse_words(json.dumps(told).encode()).interface.protocol == 7
 
 
 @pytest.mark.parametrize(

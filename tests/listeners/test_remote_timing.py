@@ -18,8 +18,7 @@ def test_the_offset_is_found_within_the_jitter_of_the_quickest(offset_s):
     clock, rng = ClockOffset(), np.random.default_rng(1)
     for index in range(200):
         exchange(clock, index * 0.04, offset_s, *(0.05 + rng.uniform(-0.02, 0.02, 2)))
-    assert clock.best is not None
-    assert clock.best.offset_s == pytest.approx(offset_s, abs=0.005)
+    assert clock.best is not None and clock.best.offset_s == pytest.approx(offset_s, abs=0.005)
     assert abs(clock.best.offset_s - offset_s) <= clock.best.delay_s / 2
 
 
@@ -80,11 +79,9 @@ def longest_gap_s(given):
 
 
 def test_a_long_plan_that_comes_in_time_is_left_as_it_is_and_doubles_are_given_once():
-    buffer = JitterBuffer(8, 3)
-    one = plan(0, 8)
+    buffer, one = JitterBuffer(8, 3), plan(0, 8)
     buffer.put(0, one, one.made_at_s + 0.05)
-    assert buffer.take(0.1) == [one]
-    assert buffer.shift_s == 0.0
+    assert buffer.take(0.1) == [one] and buffer.shift_s == 0.0
     buffer = JitterBuffer(8, 3)
     for _ in range(3):
         buffer.put(0, plan(0, 8), 0.1)
@@ -119,9 +116,7 @@ def test_plans_that_overtook_one_another_are_given_in_order_and_a_missing_one_is
     buffer.put(0, plan(0, 8), 0.05)
     assert len(buffer.take(0.05)) == 1
     buffer.put(6, plan(6, 8), 0.29)  # made at 0.28 s, its first frame is of 0.32 s
-    assert buffer.take(0.30) == []
-    assert len(buffer.take(0.31)) == 1
-    assert buffer.lost == 1
+    assert buffer.take(0.30) == [] and len(buffer.take(0.31)) == 1 and buffer.lost == 1
     buffer.put(3, plan(3, 8), 0.33)
     assert buffer.take(0.34) == [] and buffer.late == 1
 

@@ -49,8 +49,7 @@ def test_a_listener_of_another_space_plans_our_frames(name):
     plans = plans_of(tiny_listener(motion_space=name, groups=PRESET), speech(9))
     assert len(plans) == 3
     for plan in plans.values():
-        assert plan.frames.shape == (8, 58)
-        assert np.isfinite(plan.frames).all()
+        assert plan.frames.shape == (8, 58) and np.isfinite(plan.frames).all()
         assert (plan.jaw_rad is not None) == (name == "deca56")
 
 

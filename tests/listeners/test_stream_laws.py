@@ -134,8 +134,3 @@ def test_a_face_that_is_not_finite_is_a_face_not_known(listener):
         for face in (True, None)
     )
     assert same(tuple(stream(listener, lost)[0]), tuple(stream(listener, blind)[0]))
-
-
-def test_frames_of_another_length_are_refused(listener):
-    with pytest.raises(ValueError, match="640 samples or none, got 100"):
-        listener.step(SpeakerFrame(0.04, np.zeros(100, np.float32)), listener.start(1), *control(listener, 0))

@@ -92,8 +92,7 @@ def test_memory_of_a_stream_is_bounded_and_frames_late_or_twice_are_not_stepped_
 
 def test_heads_come_and_go_at_any_frame_and_each_hears_what_it_would_alone():
     """The law of a batch: N streams in one are N single runs, whenever each began, and whoever goes meanwhile."""
-    listener = tiny_listener()
-    people = [speech(24, seed=seed) for seed in range(3)]
+    listener, people = tiny_listener(), [speech(24, seed=seed) for seed in range(3)]
     server, plans, begin = StreamServer(listener, "tiny"), {}, (0, 5, 7)
     streams: dict[int, str] = {}
     for now in range(24 + max(begin)):
@@ -182,8 +181,7 @@ def test_heads_are_admitted_until_the_deadline_cannot_be_held_and_the_reason_has
         joined(server, str(index))
     refusal = messages.parse_words(server.join(messages.words_message(messages.Join("one more", 0)), 0.0))
     assert not refusal.final and "is full" in refusal.reason and "80 ms are promised" in refusal.reason
-    gone = next(iter(server._streams))
-    server.receive(gone, LEAVE, 0.0)
+    server.receive(next(iter(server._streams)), LEAVE, 0.0)
     joined(server, "one more")
 
 
@@ -196,14 +194,12 @@ def test_a_slower_machine_admits_fewer_and_delay_grows_with_heads():
 
 def test_batches_that_take_longer_than_measured_close_the_door():
     server = StreamServer(Counting(hop=1), "counting", slow(1.0))
-    stream = joined(server)
-    before = server.figures().most_heads
+    stream, before = joined(server), server.figures().most_heads
     for number in range(200):
         server.receive(stream, frame(number), number * FRAME_S)
         batch = server.batch()
         server.finish(batch, server.step(batch), number * FRAME_S, number * FRAME_S + 0.03)
-    assert server.figures().most_heads < before
-    assert server.figures().cost_scale > 2
+    assert server.figures().most_heads < before and server.figures().cost_scale > 2
 
 
 def test_costs_are_measured_batch_by_batch():
@@ -217,8 +213,7 @@ def test_costs_are_measured_batch_by_batch():
 
     capacity = measure_capacity(Timed(), sizes=(1, 2, 4), now_s=lambda: time_s[0])
     assert capacity.plan_s == pytest.approx((0.01, 0.02, 0.04))
-    assert capacity.other_s == pytest.approx((0.001,) * 3)
-    assert capacity.batch_s(8, 0) == pytest.approx(0.08)
+    assert capacity.other_s == pytest.approx((0.001,) * 3) and capacity.batch_s(8, 0) == pytest.approx(0.08)
 
 
 @pytest.mark.parametrize("heads", [1, 8])

@@ -26,8 +26,7 @@ def test_frames_come_in_their_order_and_none_is_left_out_while_few_are_waiting(c
 
 
 def test_when_too_many_are_waiting_the_newest_is_next_and_the_others_are_counted():
-    sent = frames(MOST_WAITING + 1)
-    inbox = filled(frames(1))
+    sent, inbox = frames(MOST_WAITING + 1), filled(frames(1))
     inbox.next()
     for frame in sent:
         inbox.put(frame)
@@ -77,8 +76,7 @@ def test_plans_in_time_or_late_between_others_are_no_matter():
 def test_plans_that_all_come_too_late_are_named_after_a_second_until_one_is_in_time(caplog):
     caplog.set_level("INFO")
     lateness = Lateness()
-    assert told(lateness, 0.0, LATE_S, 0.4) == []
-    assert told(lateness, LATE_S, 5.0, 0.4)
+    assert told(lateness, 0.0, LATE_S, 0.4) == [] and told(lateness, LATE_S, 5.0, 0.4)
     assert told(lateness, 5.0, 6.0, 0.1) == []
     assert [record.getMessage() for record in caplog.records] == [
         "the listener's plans come too late to be shown: the run continues without them",

@@ -13,15 +13,9 @@ from sfms_robot.listeners.stream_rng import Use, normals
 from sfms_robot.listeners.torch_engine import torch_engine
 
 RAW = {
-    "kind": "arig",
-    "width": 16,
-    "feedforward": 24,
-    "heads": 2,
-    "chunk_frames": 3,
-    "context_chunks": 4,
-    "context_layers": 2,
-    "diffusion": {"width": 10, "steps": 4, "train_steps": 50},
-}
+    "kind": "arig", "width": 16, "feedforward": 24, "heads": 2, "chunk_frames": 3, "context_chunks": 4,
+    "context_layers": 2, "diffusion": {"width": 10, "steps": 4, "train_steps": 50},
+}  # fmt: skip
 
 
 def arig_model(**changes) -> ArigModel:
@@ -51,8 +45,7 @@ def soft(listener: ArigListener) -> ArigListener:
 
 def talk(frames: int, seed: int = 0, face: bool = True, audio: bool = True, agent: bool = True) -> list[SpeakerFrame]:
     """Both tracks speak in turns of some frames."""
-    rng = np.random.default_rng(seed)
-    out = []
+    rng, out = np.random.default_rng(seed), []
     for index in range(frames):
         time_s = (index + 1) * FRAME_S
         level = np.where(np.sin(index / np.array([4.0, 5.0]) + seed) > 0, 0.2, 0.001)

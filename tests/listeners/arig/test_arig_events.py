@@ -124,9 +124,7 @@ def test_what_was_drawn_wrongly_is_forgotten_at_the_rate_of_the_data(rho, place,
     model.motion_high.fill_(100)
     one, two = (model.drawn(torch.full((58,), drawn), torch.full((58,), each)) for each in (place, other))
     torch.testing.assert_close(one - two, torch.full((58,), rho * (place - other)), rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(
-        model.moved(one, torch.full((58,), place)), torch.full((58,), drawn), rtol=1e-3, atol=1e-3
-    )
+    assert torch.allclose(model.moved(one, torch.full([58], place)), torch.full([58], drawn), rtol=1e-3, atol=1e-3)
 
 
 def test_an_hour_of_independent_draws_stays_where_the_data_are():

@@ -15,20 +15,10 @@ from sfms_robot.listeners.arig.stream import rotary
 from sfms_robot.signals.control import COLUMNS
 
 ABLATIONS = [
-    {},
-    {"context_chunks": 2},
-    {"state_guidance": False},
-    {"visual": False},
-    {"discrete": True},
-    {"interaction": "linear"},
-    {"motion_space": "deca56"},
-    {"sound": "wav2vec2"},
-    {"draws": "innovation"},
-    {"events": True},
-    {"events": True, "draws": "innovation"},
-    {"events": True, "discrete": True},
-    {"phase": False},
-]
+    {}, {"context_chunks": 2}, {"state_guidance": False}, {"visual": False}, {"discrete": True},
+    {"interaction": "linear"}, {"motion_space": "deca56"}, {"sound": "wav2vec2"}, {"draws": "innovation"},
+    {"events": True}, {"events": True, "draws": "innovation"}, {"events": True, "discrete": True}, {"phase": False},
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,7 @@ def denoiser(**changes) -> Denoiser:
 def test_sampling_is_equation_4_where_nothing_is_clamped_and_ddim_keeps_the_noise_it_found():
     model = denoiser()
     z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
-    alpha_bar = noise_levels(model.settings)[model.levels]
-    x = noise[:, 0]
+    alpha_bar, x = noise_levels(model.settings)[model.levels], noise[:, 0]
     for step, level in enumerate(reversed(model.levels)):
         index = len(model.levels) - 1 - step
         before = alpha_bar[index - 1] if index else torch.tensor(1.0)
@@ -35,8 +34,7 @@ def test_sampling_is_equation_4_where_nothing_is_clamped_and_ddim_keeps_the_nois
     torch.testing.assert_close(model.sample(z, noise), x, rtol=1e-3, atol=1e-3)
     model = denoiser(sampler="ddim")
     z, noise = torch.randn(4, 8), torch.randn(4, 5, 3)
-    alpha_bar = noise_levels(model.settings)[model.levels].float()
-    x = noise[:, 0]
+    alpha_bar, x = noise_levels(model.settings)[model.levels].float(), noise[:, 0]
     for index in reversed(range(5)):
         level = model.level(torch.full((4,), model.levels[index]))
         found = model(x, model.modulate(z, level))
@@ -93,10 +91,8 @@ def test_codes_are_drawn_by_their_probability_and_noise_for_another_number_of_st
     with pytest.raises(ValueError, match="noise for 4 steps, the sampler takes 5"):
         denoiser().sample(torch.randn(1, 8), torch.randn(1, 4, 3))
     torch.manual_seed(0)
-    head = CodeHead(3, 8, 8, (3, 2))
-    z = torch.randn(1, 8)
-    drawn = head.sample(z.expand(4000, 8), torch.randn(4000, 1, 1))
-    kinds, counts = drawn.unique(dim=0, return_counts=True)
+    head, z = CodeHead(3, 8, 8, (3, 2)), torch.randn(1, 8)
+    kinds, counts = head.sample(z.expand(4000, 8), torch.randn(4000, 1, 1)).unique(dim=0, return_counts=True)
     assert len(kinds) <= 6
     alpha_bar = torch.softmax(head.classify(z), -1)[0].sort().values
     torch.testing.assert_close(counts.sort().values / 4000, alpha_bar[-len(kinds) :], rtol=0, atol=0.03)

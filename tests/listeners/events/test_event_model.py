@@ -40,8 +40,7 @@ def talk(frames=FRAMES, seed=0):
 
 def sound(active, seed=0):
     """(N, 640) noise, loud where somebody speaks."""
-    rng = np.random.default_rng(seed)
-    level = np.where(active, 0.1, 1e-4)[:, None]
+    rng, level = np.random.default_rng(seed), np.where(active, 0.1, 1e-4)[:, None]
     return (level * rng.standard_normal((len(active), FRAME_SAMPLES))).astype(np.float32)
 
 
@@ -108,8 +107,7 @@ def test_a_look_away_is_followed_by_a_look_back(usual):
     assert len(looks) >= 4
     for away, back in zip(looks[::2], looks[1::2], strict=False):
         assert away.target_rad != AT_PERSON and back.target_rad == AT_PERSON
-        assert 0 <= back.start_s - away.end_s < 0.2
-        assert math.hypot(*away.target_rad) == pytest.approx(away.size)
+        assert 0 <= back.start_s - away.end_s < 0.2 and math.hypot(*away.target_rad) == pytest.approx(away.size)
     aside_s = sum(event.duration_s for event in looks[::2])
     assert 0.005 < aside_s / (60 * MINUTES) < 0.25
 
@@ -176,8 +174,7 @@ def test_a_head_that_moves_as_it_talks_does_not_nod_and_one_that_is_silent_does(
 
 
 def faces():
-    rng = np.random.default_rng(4)
-    still = np.zeros((FRAMES, MOTION_DIM), np.float32)
+    rng, still = np.random.default_rng(4), np.zeros((FRAMES, MOTION_DIM), np.float32)
     upside = still.copy()
     upside[:, 0] = np.pi
     upside[:, 1] = np.pi * np.sign(rng.normal(size=FRAMES))
@@ -194,8 +191,7 @@ def faces():
 
 @pytest.mark.parametrize(("name", "face"), list(faces()), ids=lambda value: value if isinstance(value, str) else "")
 def test_a_face_that_lies_never_makes_it_nod_without_end(name, face):
-    attention = np.random.default_rng(5).random(FRAMES)
-    events, hazards = listen(conversation(attention=attention, face=face))
+    events, hazards = listen(conversation(attention=np.random.default_rng(5).random(FRAMES), face=face))
     assert len(of("nod", events)) <= MOST_NODS * MINUTES
     assert np.isfinite(hazards).all()
 
@@ -222,8 +218,7 @@ def test_own_history_replaces_what_was_decided():
     frames = list(conversation())[:1000]
     nods = [ListenerEvent("nod", 10.0, 2.0, 0.1), ListenerEvent("nod", 20.0, 0.5, 0.1)]
     _, hazards = listen(frames, own=nods)
-    inside = slice(round(10.0 / FRAME_S) + 2, round(12.0 / FRAME_S) - 2)
-    assert not hazards[inside].any()
+    assert not hazards[slice(round(10.0 / FRAME_S) + 2, round(12.0 / FRAME_S) - 2)].any()
     _, none = listen(frames, own=())
     before = round(10.0 / FRAME_S)
     np.testing.assert_array_equal(hazards[:before], none[:before])
@@ -258,8 +253,7 @@ def test_a_smile_is_returned_in_time_and_size_and_more_smiles_more_often():
 
 @pytest.mark.slow
 def test_a_silent_person_who_smiles_is_smiled_at_and_one_who_always_smiles_is_not_all_the_time():
-    silence = sound(np.zeros(FRAMES, bool))
-    face = smiling(np.arange(5.0, 115.0, 10.0))
+    silence, face = sound(np.zeros(FRAMES, bool)), smiling(np.arange(5.0, 115.0, 10.0))
     assert sum(len(of("smile", listen(conversation(silence, face=face), seed)[0])) for seed in range(8)) >= 8
     always = np.tile(smiling([0.0])[20], (FRAMES, 1))
     found = [of("smile", listen(conversation(face=always), seed)[0]) for seed in range(8)]

@@ -23,15 +23,13 @@ def seen(motion):
 
 
 def still(frames=FRAMES):
-    rng = np.random.default_rng(0)
-    motion = np.zeros((frames, MOTION_DIM), np.float32)
+    rng, motion = np.random.default_rng(0), np.zeros((frames, MOTION_DIM), np.float32)
     motion[:, PITCH] = np.radians(rng.normal(0, 0.2, frames))
     return motion
 
 
 def nodding(at_s, deg=5.0, hz=2.0):
-    motion = still()
-    times = np.arange(FRAMES) * FRAME_S
+    motion, times = still(), np.arange(FRAMES) * FRAME_S
     for start in at_s:
         inside = (times >= start) & (times < start + 1 / hz)
         motion[inside, PITCH] += np.radians(deg) * np.sin(np.pi * hz * (times[inside] - start)) ** 2
@@ -45,8 +43,7 @@ def test_each_nod_is_seen_once_as_it_ends(deg, offset):
     motion = nodding(at_s, deg)
     motion[:, PITCH] = (motion[:, PITCH] + offset + np.pi) % (2 * np.pi) - np.pi
     found = np.flatnonzero(seen(motion)[0]) * FRAME_S
-    assert len(found) == len(at_s)
-    assert (np.abs(found - at_s - 0.45) < 0.2).all()
+    assert len(found) == len(at_s) and (np.abs(found - at_s - 0.45) < 0.2).all()
 
 
 def test_a_look_down_and_noise_are_no_nods():

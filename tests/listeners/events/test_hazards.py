@@ -57,15 +57,13 @@ def test_one_row_is_a_row_of_many_and_a_kind_is_a_kind_of_all(tables):
 
 
 def test_what_does_not_apply_says_nothing_and_the_largest_terms_are_returned(tables):
-    bank = HazardBank(tables.hazards)
-    nothing = np.full(len(EVIDENCE), np.nan)
+    bank, nothing = HazardBank(tables.hazards), np.full(len(EVIDENCE), np.nan)
     assert not bank.contributions(nothing).any()
     np.testing.assert_allclose(
         bank.log_odds(bank.contributions(nothing)), [h.intercept for h in tables.hazards.values()]
     )
     bank, evidence = HazardBank(tables.hazards), rows(3)[0]
-    given_terms = bank.contributions(evidence)
-    told = bank.largest(given_terms, "nod")
+    told = bank.largest(bank.contributions(evidence), "nod")
     assert 1 <= len(told) <= 4 and set(told) <= set(tables.hazards["nod"].weights)
     assert list(np.abs(list(told.values()))) == sorted(np.abs(list(told.values())), reverse=True)
 

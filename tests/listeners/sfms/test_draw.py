@@ -30,8 +30,7 @@ def told(*events, how: SmileCourse = HOW):
 
 
 def test_a_smile_rises_to_its_size_and_without_one_or_in_a_laugh_nothing_is_wanted():
-    wanted = told(SMILE)
-    times_s = (1 + np.arange(90)) * 0.04
+    wanted, times_s = told(SMILE), (1 + np.arange(90)) * 0.04
     under_way = (times_s >= SMILE.start_s - 1e-6) & (times_s < SMILE.end_s - 1e-6)
     np.testing.assert_array_equal(np.isfinite(wanted), under_way)
     shown = wanted[under_way]
@@ -66,8 +65,7 @@ def test_a_nod_goes_to_its_size_at_each_swing_less_and_comes_back(start_s: float
     for swing in range(swings):
         lowest = turns[(since_s > swing * each_s) & (since_s <= (swing + 1) * each_s)].max()
         assert lowest == pytest.approx(size * NODDING.fall**swing, rel=1e-3)
-    back_s = since_s[turns == 0]
-    off_s = np.abs(back_s[:, None] - each_s * np.arange(1, swings + 1))
+    off_s = np.abs(since_s[turns == 0][:, None] - each_s * np.arange(1, swings + 1))
     assert off_s.min(axis=1).max() <= 0.0201 and off_s.min(axis=0).max() <= 0.0201
     np.testing.assert_allclose(course.spread[rows], NODDING.spread * size, rtol=1e-5)
 
@@ -83,8 +81,7 @@ def test_a_narrow_course_is_kept_to_by_any_weights_and_smiles_not_told_are_as_th
     before, after = (
         corners(plans_of(told_listener(hop=1, **how_), speech(70), events=[SMILE])) for how_ in ({}, {"sampling": how})
     )
-    shown = told(SMILE)[1:71]
-    plateau = np.flatnonzero(shown > 0.95 * SMILE.size)
+    plateau = np.flatnonzero(told(SMILE)[1:71] > 0.95 * SMILE.size)
     assert np.abs(after[plateau] - SMILE.size).mean() < np.abs(before[plateau] - SMILE.size).mean()
     plain, steered = told_listener(hop=2), told_listener(hop=2, sampling={"smile": {"spread": 0.1}})
     nod = ListenerEvent("nod", 0.8, 0.8, 0.1, swings=2)
@@ -108,9 +105,7 @@ def test_a_course_that_is_none_is_refused(smile, text):
 
 def test_a_listener_that_cannot_keep_to_one_says_so():
     for kind in ("nod", "smile"):
-        with pytest.raises(
-            ConfigError, match=f"sampling.{kind}: expected events: true, without which there is no {kind}"
-        ):
+        with pytest.raises(ConfigError, match=f"sampling.{kind}: expected events: true, without which .* no {kind}"):
             tiny_listener(sampling={kind: {"spread": 0.1}})
     head, face = [*POSE_CHANNELS, SMILE_CORNERS[0]], [name for name in FACE if name != SMILE_CORNERS[0]]
     group = {"levels": (3, 2), "keyframe_cost": 1.0}
@@ -168,11 +163,7 @@ def test_a_ramp_begins_no_earlier_than_what_it_was_told_for():
     assert settled.tolist() == [NOW + 2, NOW + 1, NOW]  # the next frame is kept, whatever is told; nothing told anew
     drawn = np.where(kept == draw.UNDECIDED, window(0, 0, 0, 0, 0, 0, 0, 0, 3), kept)
     found = draw.anchored(drawn, kept == draw.UNDECIDED, settled, RAMP)
-    assert found[:, :, 0].tolist() == [
-        [0, 7, 0, 0, 0, 0, 7, 0, 3],
-        [0, 7, 0, 0, 0, 7, 0, 0, 3],
-        [0, 7, 0, 0, 0, 0, 0, 0, 3],
-    ]
+    assert ["".join(map(str, row)) for row in found[:, :, 0].tolist()] == ["070000703", "070007003", "070000003"]
 
 
 @pytest.mark.parametrize("hop", [pytest.param(1, marks=pytest.mark.slow), 2, 4])
@@ -184,8 +175,7 @@ def test_nods_come_out_as_told_and_when(hop: int):
         ListenerEvent("nod", 2.0 + 3.0 * at, each_s * swings, np.radians(5.0 if at % 2 else 4.0), swings)
         for at, (each_s, swings) in enumerate(made_s)
     ]
-    silence = speech(round(25 * (nods[-1].end_s + 2)))
-    motions = rollout(listener, silence, [1, 2, 3], nods).motion
+    motions = rollout(listener, speech(round(25 * (nods[-1].end_s + 2))), [1, 2, 3], nods).motion
     seen = added_up(asked_and_seen(nods, Detected.of(motion), {"nod": -0.06}) for motion in motions)["nod"]
     assert seen.recall >= 26 / 27 and seen.precision >= 26 / 27
     pitch = np.degrees(motions[..., CHANNEL_INDEX["pitch"]])

@@ -54,16 +54,14 @@ def scores(strategy: str) -> ScoreNetwork | ConditionalScore:
 @pytest.mark.parametrize("strategy", sorted({*get_args(Strategy)} - {"penalised", "adaptive"}))
 @pytest.mark.parametrize("k", [(1, 1), (3, 7), (48, 10)])
 def test_every_strategy_places_exactly_k(strategy, k):
-    motion = torch.randn(3, 48, 3)
-    mask = place(motion, k, strategy, member=MEMBER, score=scores(strategy), sweeps=2)
+    mask = place(torch.randn(3, 48, 3), k, strategy, member=MEMBER, score=scores(strategy), sweeps=2)
     assert torch.equal(mask.sum(1), torch.tensor(k).float().expand(3, 2))
     assert set(mask.unique().tolist()) <= {0.0, 1.0}
 
 
 @given(st.integers(1, 12), st.floats(0.05, 5.0))
 def test_sampled_placement_has_exactly_k_and_reaches_every_score(count: int, temperature: float):
-    scores = torch.randn(2, 12, 1, requires_grad=True)
-    mask, relaxed = place_learned(scores, [count], temperature)
+    mask, relaxed = place_learned(torch.randn(2, 12, 1, requires_grad=True), [count], temperature)
     torch.testing.assert_close(mask.detach().round().sum(1), torch.full((2, 1), float(count)))
     assert ((mask.detach() - mask.detach().round()).abs() < 1e-5).all()
     assert relaxed.sum(1).allclose(torch.full((2, 1), float(count)), atol=1e-3)
@@ -90,11 +88,9 @@ def test_adaptive_placement_takes_every_likely_frame_and_sampling_follows_the_ca
     mask, relaxed = place_adaptive(scores, 0.5, torch.Generator().manual_seed(0))
     (mask.sum() + relaxed.sum()).backward()
     assert {*mask.detach().round().unique().tolist()} <= {0.0, 1.0} and bool((scores.grad != 0).all())
-    logits = torch.log(torch.tensor([0.1, 0.2, 0.3, 0.4]))
-    draws = 4000
+    logits, draws = torch.log(torch.tensor([0.1, 0.2, 0.3, 0.4])), 4000
     mask, _ = place_learned(logits[None, :, None].expand(draws, 4, 1), [1], 0.1, torch.Generator().manual_seed(0))
-    counted = mask.round().sum(0)[:, 0]
-    expected = draws * torch.softmax(logits, 0)
+    counted, expected = mask.round().sum(0)[:, 0], draws * torch.softmax(logits, 0)
     chi_square = ((counted - expected) ** 2 / expected).sum()
     assert chi_square < 16.27  # 3 degrees of freedom, p = 0.001
 
@@ -131,13 +127,10 @@ def every_mask(frames: int, count: int) -> torch.Tensor:
 
 @given(st.integers(1, 9), st.integers(0, 10_000))
 def test_the_cost_of_a_mask_is_its_interpolation_error(count: int, seed: int):
-    motion = walk(seed, 1)
-    masks = every_mask(9, count)
+    motion, masks = walk(seed, 1), every_mask(9, count)
     same = motion.expand(len(masks), -1, -1)
     drawn = Neighbours.in_mask(masks[..., None]).interpolate((same * masks[..., None])[:, :, None])[:, :, 0]
-    torch.testing.assert_close(
-        mask_cost(segments(same), masks), ((drawn - same) ** 2).sum((1, 2)), rtol=1e-6, atol=1e-8
-    )
+    assert torch.allclose(mask_cost(segments(same), masks), ((drawn - same) ** 2).sum((1, 2)), rtol=1e-6, atol=1e-8)
 
 
 @given(st.sets(st.integers(0, 7), max_size=3), st.integers(1, 5), st.integers(0, 10_000))
@@ -157,17 +150,14 @@ def test_completion_errors_are_those_of_the_best_mask_through_the_chosen_frames(
 
 @given(st.sets(st.integers(0, 8), min_size=1, max_size=6), st.integers(0, 10_000))
 def test_stretch_errors_tell_what_one_more_keyframe_changes(chosen, seed: int):
-    motion = walk(seed, 1)
-    mask = torch.zeros(1, 9, dtype=torch.float64)
+    motion, mask = walk(seed, 1), torch.zeros(1, 9, dtype=torch.float64)
     mask[0, sorted(chosen)] = 1.0
     now, then = stretch_errors(segments(motion), mask)
     before = mask_cost(segments(motion), mask)
     for frame in set(range(9)) - set(chosen):
         more = mask.clone()
         more[0, frame] = 1.0
-        torch.testing.assert_close(
-            before - mask_cost(segments(motion), more), (now - then)[:, frame], rtol=1e-6, atol=1e-8
-        )
+        assert torch.allclose(before - mask_cost(segments(motion), more), (now - then)[:, frame], rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("together", [1, 2, 3])
@@ -182,12 +172,10 @@ def test_a_sweep_keeps_k_and_never_makes_a_mask_worse(together: int, count: int)
 
 
 def test_conditional_scores_never_choose_a_frame_twice_and_see_no_other_track():
-    score = scores("learned")
-    motion = torch.randn(4, 16, 3).cumsum(1)
+    score, motion = scores("learned"), torch.randn(4, 16, 3).cumsum(1)
     mask = place(motion, [16, 3], "learned", member=MEMBER, score=score)
     assert (mask[..., 0] == 1).all()
-    alone = place(motion[2:3], [16, 3], "learned", member=MEMBER, score=score)
-    assert torch.equal(alone[0], mask[2])
+    assert torch.equal(place(motion[2:3], [16, 3], "learned", member=MEMBER, score=score)[0], mask[2])
 
 
 @settings(max_examples=10)
@@ -238,8 +226,7 @@ def test_no_other_mask_costs_less(one: float, other: float, ramp, seed: int):
     motion, cost = walk3(seed, 8), torch.tensor([one, other])
     mask = place_penalised(motion, [one, other], MEMBER, ramp=ramp)
     found = errors(motion, mask, ramp)[0] + cost * mask.sum(1)[0]
-    every = torch.tensor(list(itertools.product([0.0, 1.0], repeat=8)))[1:]
-    masks = every[..., None].expand(-1, -1, 2)
+    masks = torch.tensor(list(itertools.product([0.0, 1.0], repeat=8)))[1:][..., None].expand(-1, -1, 2)
     totals = errors(motion.expand(len(masks), -1, -1), masks, ramp) + cost * masks.sum(1)
     torch.testing.assert_close(found, totals.min(0).values, rtol=1e-4, atol=1e-4)
 

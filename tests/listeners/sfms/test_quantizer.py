@@ -53,8 +53,7 @@ def test_every_vector_is_the_nearest_to_itself_and_passes_its_gradient_to_the_en
     indices = torch.stack([torch.arange(5), torch.arange(5) % 3], dim=-1)
     assert torch.equal(codebook.indices(codebook.codes(indices)), indices)
     assert codebook.indices(torch.randn(1, 200, 2, 2) * 9)[..., 1].max() < 3
-    codebook = book()
-    latent = torch.randn(1, 4, 2, 2, requires_grad=True)
+    codebook, latent = book(), torch.randn(1, 4, 2, 2, requires_grad=True)
     code = codebook.nearest(latent)
     torch.testing.assert_close(code.detach(), codebook.codes(codebook.indices(latent)))
     code.sum().backward()
@@ -65,8 +64,7 @@ def test_commitment_is_the_distance_to_the_vectors_at_keyframes_only():
     codebook = book((1, 1))
     codebook.vectors.zero_()
     latent = torch.tensor([[[[3.0, 1.0], [0.0, 0.0]], [[9.0, 9.0], [9.0, 9.0]]]], requires_grad=True)
-    mask = torch.tensor([[[1.0, 1.0], [0.0, 0.0]]])
-    loss = codebook.commitment(latent, mask)
+    loss = codebook.commitment(latent, torch.tensor([[[1.0, 1.0], [0.0, 0.0]]]))
     assert loss.item() == pytest.approx((9 + 1) / 2 / 2)
     loss.backward()
     assert (latent.grad[0, 1] == 0).all() and latent.grad[0, 0, 0, 0] > 0
@@ -78,17 +76,14 @@ def test_vectors_settle_at_the_means_of_their_keyframes_and_idle_ones_begin_anew
     for _ in range(600):
         noise = torch.randn(1, 40, 1, 1, generator=drawn) * 0.1
         codebook.learn(torch.where(torch.arange(40)[None, :, None, None] < 20, -2.0, 3.0) + noise, mask, drawn)
-    found = sorted(codebook.vectors[0, :, 0].tolist())
-    assert found == pytest.approx([-2.0, 3.0], abs=0.05)
+    assert sorted(codebook.vectors[0, :, 0].tolist()) == pytest.approx([-2.0, 3.0], abs=0.05)
     codebook, drawn = book((8,), 1), torch.Generator().manual_seed(0)
     codebook.vectors.fill_(100.0)
-    latent = torch.rand(1, 400, 1, 1, generator=drawn)
-    mask = torch.zeros(1, 400, 1)
+    latent, mask = torch.rand(1, 400, 1, 1, generator=drawn), torch.zeros(1, 400, 1)
     mask[:, ::2] = 1.0
     for _ in range(30):
         codebook.learn(latent, mask, drawn)
-    assert ((codebook.vectors >= 0) & (codebook.vectors <= 1)).all()
-    assert len(codebook.indices(latent).unique()) == 8
+    assert ((codebook.vectors >= 0) & (codebook.vectors <= 1)).all() and len(codebook.indices(latent).unique()) == 8
 
 
 @pytest.mark.parametrize("kind", ["fsq", "vq"])

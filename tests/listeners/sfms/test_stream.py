@@ -37,8 +37,7 @@ def offline(listener, speaker, seed):
         seen = Context(*parts, own.numpy(), np.zeros((1, p + h, 0), np.float32))
         drawn = torch.from_numpy(listener.sampler.draw(seen, np.array([p - 1]), [seed], [now + h]))
         tokens[past.stop : past.stop + h] = drawn[0, p:]
-        decided = now + 1 + h
-        window = model.tokenizer.decode(drawn)[0]
+        decided, window = now + 1 + h, model.tokenizer.decode(drawn)[0]
         joined = torch.from_numpy(
             join(path[now + 1 : now + 3].numpy(), window[-h - 2 :].numpy(), settings.sampling.seam_frames)
         )
@@ -63,8 +62,7 @@ def test_sampling_follows_the_probabilities_of_the_nucleus():
     chance = np.random.default_rng(0).random((2000, 1))
     drawn = sample(np.tile(logits, (2000, 1, 1)), np.zeros(1, np.float32), np.float32(0.65), chance)
     counts = np.bincount(drawn[:, 0], minlength=4)
-    assert counts[0] == counts[3] == 0
-    assert counts[1] / 2000 == pytest.approx(4 / 7, abs=0.04)
+    assert counts[0] == counts[3] == 0 and counts[1] / 2000 == pytest.approx(4 / 7, abs=0.04)
 
 
 @pytest.mark.parametrize(("horizon", "hop"), [(1, 1), (2, 1), (8, 4), (16, 12)])
@@ -84,9 +82,6 @@ def test_smoothing_rounds_the_corners_of_the_head_alone_and_a_plan_goes_on_in_pl
     np.testing.assert_array_equal(shown[:, 6:], corner[2:, 6:])
     assert np.abs(np.diff(shown[:, 0], 2)).max() <= 0.5 * np.abs(np.diff(corner[:, 0], 2)).max()
     np.testing.assert_array_equal(tiny_listener().shown(corner), corner[2:])
-    tail = np.array([[0.0], [1.0]], np.float32)
-    decoded = np.full((10, 1), 5.0, np.float32)
-    path = join(tail, decoded, seam=4)[:, 0]
-    assert path[:2].tolist() == [0.0, 1.0]
-    assert path[5:].tolist() == [5.0] * 5
+    path = join(np.array([[0.0], [1.0]], np.float32), np.full((10, 1), 5.0, np.float32), seam=4)[:, 0]
+    assert path[:2].tolist() == [0.0, 1.0] and path[5:].tolist() == [5.0] * 5
     assert np.diff(path).min() >= 0 and np.diff(path).max() < 2

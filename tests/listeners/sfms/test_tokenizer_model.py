@@ -17,8 +17,7 @@ def test_every_kind_of_tokenizer_encodes_and_decodes(placement, quantizer):
         groups = {name: group | {"keyframes": None, "keyframe_cost": 40.0} for name, group in groups.items()}
     scores = {"width": 8, "layers": 1, "heads": 2}
     settings = tiny_settings(placement=placement, quantizer=quantizer, scores=scores, groups=groups)
-    tokenizer = Tokenizer(settings).eval()
-    motion = torch.randn(2, 48, 58)
+    tokenizer, motion = Tokenizer(settings).eval(), torch.randn(2, 48, 58)
     mask = tokenizer.place(motion)
     tokens = tokenizer.encode(motion, mask)
     assert torch.equal(tokens > 0, mask > 0)

@@ -98,14 +98,12 @@ def test_tokens_are_revoked_where_told_otherwise_and_the_last_keyframe_is_held_a
 
 def test_gaze_is_left_to_kinematics_and_each_stream_sways_from_rest_its_own_way(told):
     for plan in plans_of(told, speech(30), events=[NOD]).values():
-        assert (plan.frames[:, GAZE] == 0).all()
-        assert np.abs(plan.frames[:, :6]).max() > 0
+        assert (plan.frames[:, GAZE] == 0).all() and np.abs(plan.frames[:, :6]).max() > 0
     one, other = plans_of(told, speech(90), seed=1), plans_of(told, speech(90), seed=2)
     assert not np.array_equal(one[80].frames[:, :6], other[80].frames[:, :6])
     nothing = np.zeros((1, 90, 58), np.float32)
     still = told.with_sway(nothing, told.start(1).sway[None], 0) - told.engine.tensors["motion_mean"]
-    assert np.abs(still[0, 0, :6]).max() < 1e-4 < np.abs(still[0, 60:, :6]).max()
-    assert not still[..., 6:].any()
+    assert np.abs(still[0, 0, :6]).max() < 1e-4 < np.abs(still[0, 60:, :6]).max() and not still[..., 6:].any()
 
 
 def context(told, control: torch.Tensor) -> Context:
