@@ -199,8 +199,7 @@ def seamless_person(
     vad = [{"start": start, "end": end} for start, end in spans]
     told = {"id": name, "metadata:transcript": words, "metadata:vad": vad}
     (folder / f"{name}.json").write_text(json.dumps(told))
-    times_s = np.arange(frames) / 30
-    valid = np.ones((frames, 1), np.float32)
+    times_s, valid = np.arange(frames) / 30, np.ones((frames, 1), np.float32)
     for start, end in invalid:
         valid[start:end] = 0
     rotation = 0.15 * np.sin(times_s[:, None] * (3.0, 1.1, 0.7) + float(first))

@@ -27,13 +27,9 @@ def main() -> None:
         resume = given.get("resume", False) or (group.restarts > 0)
         scratch = Path(given["scratch"]) if "scratch" in given else None
         run = Run(
-            resume=resume,
-            device=torch.device("cpu"),
-            watches=(watch,),
-            group=group,
-            accumulate=given.get("accumulate"),
-            scratch=scratch,
-        )
+            resume=resume, device=torch.device("cpu"), watches=(watch,), group=group,
+            accumulate=given.get("accumulate"), scratch=scratch,
+        )  # fmt: skip
         chosen = settings(steps=given["steps"], batch=8, evaluate_every=4, checkpoint_every=given.get("every", 500))
         figures = train_arig(chosen, Path(given["data"]), out, run)
         if group.first:

@@ -26,12 +26,7 @@ def meeting_person(**changes) -> MeetingPerson:
     """One to whom nothing happens in a meeting of five minutes, and who does nothing."""
     spans = ("nods", "shakes", "tilts", "unseen", "laughs", "talk", "backchannels", "others", "others_laughs")
     whole = {
-        "meeting": "M1a",
-        "agent": "B",
-        "participant": "P1",
-        "until_s": 300.0,
-        "gaze": None,
-        "floor": (),
+        "meeting": "M1a", "agent": "B", "participant": "P1", "until_s": 300.0, "gaze": None, "floor": (),
         "asked": np.zeros(0),
-    }
+    }  # fmt: skip
     return MeetingPerson(**dict.fromkeys(spans, NONE) | whole | changes)

@@ -31,8 +31,7 @@ def settings(listener: dict | None = None, **phase) -> config.ArigTraining:
 
 def dyad(name: str, scene: str, seed: int) -> clips.Dyad:
     """12 s: who speaks does so in turns of a second; the agent's jaw follows its voice, its head the user's."""
-    rng = np.random.default_rng(seed)
-    frames = 12 * HZ
+    rng, frames = np.random.default_rng(seed), 12 * HZ
     turn = (np.arange(frames) // HZ + seed) % 2 == 0
     agent = turn if scene != "listening" else np.zeros(frames, bool)
     user = ~turn if scene != "speaking" else np.zeros(frames, bool)

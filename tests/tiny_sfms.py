@@ -54,8 +54,7 @@ def told_listener(**changes) -> SfmsListener:
 
 
 def speech(frames: int, seed: int = 0, face: bool = True, audio: bool = True) -> list[SpeakerFrame]:
-    rng = np.random.default_rng(seed)
-    out = []
+    rng, out = np.random.default_rng(seed), []
     for index in range(frames):
         time_s = (index + 1) * FRAME_S
         sound = rng.normal(0, 0.1, FRAME_SAMPLES).astype(np.float32)

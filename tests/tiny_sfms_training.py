@@ -17,9 +17,8 @@ def write_dyads(folder: Path) -> Path:
         rng = np.random.default_rng(seed)
         motion = (0.2 + 0.1 * np.sin(np.arange(FRAMES)[:, None] / 6 + rng.uniform(0, 6, 58))).astype(np.float32)
         audio = rng.normal(0, 0.05, FRAMES * FRAME_SAMPLES).astype(np.float32)
-        dyad = clips.Dyad(
-            name=split, audio=audio, speaker=motion[::-1].copy(), listener=motion, listening=np.ones(FRAMES, bool)
-        )
+        shared = {"listener": motion, "listening": np.ones(FRAMES, bool)}
+        dyad = clips.Dyad(name=split, audio=audio, speaker=motion[::-1].copy(), **shared)
         clips.save(folder / split, [dyad])
     return folder
 

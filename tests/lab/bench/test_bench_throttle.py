@@ -13,8 +13,7 @@ linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="holding
 
 
 def test_a_run_that_is_well_has_no_problem_and_misses_no_listener_before_its_first_plan():
-    assert state_problems(WELL, PLANS) == []
-    assert state_problems(WELL, []) == []
+    assert state_problems(WELL, PLANS) == [] and state_problems(WELL, []) == []
 
 
 @pytest.mark.parametrize(
@@ -58,6 +57,5 @@ def test_a_process_and_all_that_it_starts_are_found():
 @linux
 def test_what_is_held_to_a_share_of_a_core_comes_to_its_end_all_the_same():
     with held(["-c", "print(sum(range(10_000)))"], 0.5, stdout=subprocess.PIPE) as process:
-        assert process.stdout.read() == b"49995000\n"
-        assert process.wait() == 0
+        assert process.stdout.read() == b"49995000\n" and process.wait() == 0
         process.stdout.close()

@@ -97,13 +97,11 @@ def test_a_layer_and_attention_cost_their_operations_and_gradients_as_many_again
     layer = torch.nn.Linear(10, 20)
     with OperationCount() as count:
         layer(torch.randn(5, 10)).sum().backward()
-    assert count.matrix == 2 * 5 * 10 * 20 * 2
-    assert count.drawn == 50
+    assert count.matrix == 2 * 5 * 10 * 20 * 2 and count.drawn == 50
     rows = torch.randn(2, 4, 16, 8)
     with OperationCount() as count:
         scaled_dot_product_attention(rows, rows, rows)
-    assert count.matrix == 2 * (2 * 2 * 4 * 16 * 16 * 8)
-    assert count.bytes >= rows.numel() * 4 * 4
+    assert count.matrix == 2 * (2 * 2 * 4 * 16 * 16 * 8) and count.bytes >= rows.numel() * 4 * 4
 
 
 @pytest.mark.parametrize(("most_frames", "pieces"), [(1200, 1), (48, 2), (1, 4)])

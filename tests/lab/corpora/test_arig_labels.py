@@ -74,11 +74,9 @@ def test_words_and_nods_give_feedback():
 
 @pytest.mark.parametrize(("frames", "answer"), [(24, True), (25, False)])
 def test_without_dialogue_acts_short_words_in_the_others_turn_are_answers(frames, answer):
-    other = np.ones(100, bool)
-    active = np.zeros(100, bool)
+    other, active = np.ones(100, bool), np.zeros(100, bool)
     active[40 : 40 + frames] = True
-    assert labels.short_answers(active, other).any() == answer
-    assert not labels.short_answers(active, ~other).any()
+    assert labels.short_answers(active, other).any() == answer and not labels.short_answers(active, ~other).any()
 
 
 def test_activity_alone_is_labelled_too():

@@ -38,17 +38,10 @@ def plain(name: str, frames: int = 60, **more) -> Dyad:
 
 
 WRITERS: dict[str, Callable[[Path], Path]] = {
-    "l2l": write.l2l,
-    "lm_listener": write.lm_listener,
-    "react": write.react,
-    "react2025": write.react2025,
-    "dualtalk": write.dualtalk,
-    "dualtalk_arkit": write.dualtalk_arkit,
-    "dim": write.dim,
-    "vico": write.vico,
-    "seamless": write.seamless,
-    "composed": composed,
-}
+    "l2l": write.l2l, "lm_listener": write.lm_listener, "react": write.react, "react2025": write.react2025,
+    "dualtalk": write.dualtalk, "dualtalk_arkit": write.dualtalk_arkit, "dim": write.dim, "vico": write.vico,
+    "seamless": write.seamless, "composed": composed,
+}  # fmt: skip
 
 
 def test_every_layout_has_a_writer_here():
@@ -95,8 +88,7 @@ def test_l2l_host_listens_to_the_guest_and_mel_becomes_natural_log(tmp_path):
     dataset = open_dataset(tmp_path, "test")
     assert [name.split("_p")[0] for name in dataset.names] == ["conan_test"] * 2 + ["fallon_test"] * 3
     assert any("devi2" in note for note in dataset.notes)
-    folder = tmp_path / "fallon" / "test"
-    dyad = dataset[4]
+    folder, dyad = tmp_path / "fallon" / "test", dataset[4]
     for values, file in ((dyad.listener, "p1_list_faces"), (dyad.speaker, "p0_speak_faces")):
         np.testing.assert_array_equal(values, np.load(folder / f"{file}_clean_deca.npy")[2, :, :56])
     power = np.load(folder / "p0_speak_audio_clean_deca.npy")[2]
@@ -152,8 +144,7 @@ def test_react_pairs_are_mirrored_in_the_order_of_the_matrix(tmp_path):
     dataset = open_dataset(write.react(tmp_path), "validation")
     people = [name.split("+")[2] for name in dataset.names]
     assert people == ["Novice_video"] * 2 + ["Expert_video"] * 2
-    assert [clip.row for clip in dataset.clips] == [0, 1, 2, 3]
-    assert dataset.lengths == (750,) * 4
+    assert [clip.row for clip in dataset.clips] == [0, 1, 2, 3] and dataset.lengths == (750,) * 4
     np.testing.assert_array_equal(dataset[0].speaker, dataset[2].listener)
 
 
@@ -285,8 +276,7 @@ def test_files_in_the_other_order_are_refused_unless_it_is_said(name, writer, ri
         open_dataset(tmp_path / "wrong", split)
     turned = open_dataset(tmp_path / "wrong", split, order=wrong)
     assert looks_like([turned[0].listener], turned.space, wrong) == wrong
-    pose = turned[0].listener[:, -6:]
-    assert pose[:, 4:].std(axis=0).max() < 0.1
+    assert turned[0].listener[:, -6:][:, 4:].std(axis=0).max() < 0.1
 
 
 @pytest.mark.parametrize(

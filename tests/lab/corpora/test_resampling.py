@@ -34,8 +34,7 @@ def dyad(frames: int, fps: float, space: str = "arkit58", mel: bool = False) -> 
 
 @pytest.mark.parametrize("fps", [24.0, 30.0, 50.0, 60.0])
 def test_of_other_rates_the_newest_row_that_is_complete_stands_at_each_time(fps):
-    ends_s = (np.arange(200) + 1) / fps
-    wanted_s = (np.arange(60) + 1) / FRAME_HZ
+    ends_s, wanted_s = (np.arange(200) + 1) / fps, (np.arange(60) + 1) / FRAME_HZ
     chosen = at_rate(ends_s, fps, 60, FRAME_HZ)
     for wanted, given in zip(wanted_s, chosen, strict=True):
         complete = ends_s[ends_s <= wanted + 1e-6]

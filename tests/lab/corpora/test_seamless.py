@@ -73,8 +73,7 @@ def test_converted_motion_keeps_its_place_in_time(tmp_path):
     valid = np.ones((frames, 1), np.float32)
     valid[120:180] = 0
     write.seamless(tmp_path, 1, frames, **{ROTATION: rotation * valid, UNITS: units * valid, VALID: valid})
-    dataset = open_dataset(tmp_path, "train")
-    rest = np.median(ramp[valid[:, 0] > 0])
+    dataset, rest = open_dataset(tmp_path, "train"), np.median(ramp[valid[:, 0] > 0])
     for dyad, first in zip(dataset[:2], (0, 182), strict=True):
         ours = to_ours(dyad, Residual())
         ends_s = first / 30 + np.maximum((np.arange(len(ours.listener)) + 1) / FRAME_HZ, 1 / 30)
@@ -150,8 +149,7 @@ def test_every_unit_with_a_shape_moves_it_and_nothing_else():
 def test_key_points_tell_which_way_heads_turn(mirrored, tmp_path):
     write.seamless(tmp_path, 2)
     for name in (f"V00_S{session}_I00000582_P{person}" for session in ("0809", "0810") for person in ("0947", "0948A")):
-        file = file_of(tmp_path, name, ".npz")
-        units = rows_of(tmp_path, name, UNITS)
+        file, units = file_of(tmp_path, name, ".npz"), rows_of(tmp_path, name, UNITS)
         points = write.seen(rows_of(tmp_path, name, ROTATION), units[:, FAU_VALUE.index(26)], units[:, -1], mirrored)
         rewritten(file, **{"boxes_and_keypoints:keypoints": points})
     dataset = open_dataset(tmp_path, "train")
@@ -284,7 +282,6 @@ def test_one_harm_is_one_line_that_names_the_file_and_the_rest_is_usable(name, t
 def test_a_voice_beside_its_annotation_is_a_wrong_time_stamp(tmp_path):
     write.seamless(tmp_path, 1, frames=600)
     write.seamless_person(tmp_path / "improvised/train/0000/0005", ONE, 600, late_s=0.8)
-    report = check_data(tmp_path)
-    (problem,) = report["splits"][0]["problems"]
+    (problem,) = check_data(tmp_path)["splits"][0]["problems"]
     assert problem["kind"] == "time stamps" and problem["count"] == 2  # of both clips
     assert "the voice comes +0.8" in problem["first"] and f"metadata:vad of {ONE}" in problem["first"]

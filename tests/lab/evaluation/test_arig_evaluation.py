@@ -102,14 +102,3 @@ def test_what_a_table_cannot_do_without_is_named(command_line, data, words, said
 def test_a_table_needs_faces_that_move(command_line, listener, data):
     ended = command_line(*TABLE_2, "--listener", listener, "--data", data)
     assert ended.code == 2 and "the clips' own motion: 250 frames differ too little to make 40 clusters" in ended.err
-
-
-def test_a_table_needs_clips_that_are_long_enough(command_line, listener, tmp_path):
-    one = dyad("short", "listening", 0)
-    parts = {
-        name: getattr(one, name)[:200] for name in ("speaker", "listener", "listening", "states", "head_of_gaze_rad")
-    }
-    sounds = {name: getattr(one, name)[: 200 * 640] for name in ("audio", "agent_audio")}
-    clips.save(tmp_path / "test", [replace(one, **parts, **sounds)])
-    ended = command_line(*TABLE_2, "--listener", listener, "--data", tmp_path)
-    assert ended.code == 2 and "no test dyad is as long as a clip of 250 frames" in ended.err

@@ -59,8 +59,7 @@ def test_gaze_is_head_and_eyes_and_its_looks_end_with_shifts():
     assert np.degrees(gaze[-1]) == pytest.approx([20, 0]) and detection.shifts(gaze) == 1
     assert detection.looks_s(gaze) == pytest.approx([5.0])
     found = detection.movement([motion], [np.ones(len(motion), bool)])
-    assert found["gaze_on_person"] == pytest.approx(0.5)
-    assert found["gaze_shifts_per_minute"] == pytest.approx(6.0)
+    assert found["gaze_on_person"] == pytest.approx(0.5) and found["gaze_shifts_per_minute"] == pytest.approx(6.0)
     assert np.isnan(detection.movement([motion], [np.zeros(len(motion), bool)])["gaze_on_person"])
 
 

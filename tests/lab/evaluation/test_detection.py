@@ -44,8 +44,7 @@ def looking_down(starts_s, deg):
     targets = np.zeros((FRAMES, 2))
     for start in starts_s:
         targets[(WHEN_S > start) & (WHEN_S < start + 0.6), 1] = np.radians(deg)
-    motion = np.zeros((FRAMES, 58), np.float32)
-    state = gaze_kinematics.start(3)
+    motion, state = np.zeros((FRAMES, 58), np.float32), gaze_kinematics.start(3)
     motion[:, :3], motion[:, list(gaze_kinematics.EYE_CHANNELS)], _ = gaze_kinematics.follow(targets, motion, state)
     return motion
 
@@ -64,8 +63,7 @@ def test_a_look_down_is_no_nod_hides_none_and_eyes_that_nobody_tracked_change_no
 def test_lateness_is_told_and_what_is_late_is_not_in_time():
     on_time = sightings(*nodding(STARTS))["nod"].offset_s
     late = sightings(*nodding(STARTS, late_s=0.24), {"nod": on_time})["nod"]
-    assert late.offset_s - on_time == pytest.approx(0.24, abs=0.045)
-    assert late.recall == late.precision == 0
+    assert late.offset_s - on_time == pytest.approx(0.24, abs=0.045) and late.recall == late.precision == 0
 
 
 def test_what_nobody_asked_for_costs_precision_and_what_is_not_there_recall():

@@ -53,8 +53,7 @@ def speaker(talk):
 
 
 def meeting(talk, nods_s):
-    silent = np.zeros(FRAMES, bool)
-    spans = np.stack([nods_s, nods_s + 0.5], axis=1)
+    silent, spans = np.zeros(FRAMES, bool), np.stack([nods_s, nods_s + 0.5], axis=1)
     return ListenerMeeting(
         participant="A", speaker=(), spans_s={"nod": spans}, aside=np.zeros(0, bool), others=talk, own=silent,
         unseen=silent, alone=talk, attention=np.full(FRAMES, np.nan),
@@ -94,8 +93,7 @@ def test_what_has_not_begun_changes_no_hazard(talk, speaker):
 
 
 def test_a_seed_decides_the_same_alone_and_beside_others(speaker):
-    decides = model(-3.0, **PHASE)
-    heard = sensed(speaker[:3000], Calmness())[1]
+    decides, heard = model(-3.0, **PHASE), sensed(speaker[:3000], Calmness())[1]
     together = decisions(decides, heard, [1, 2, 3], Calmness())
     assert together == [decisions(decides, heard, [seed], Calmness())[0] for seed in (1, 2, 3)]
     assert together[0] != together[1]
@@ -111,8 +109,7 @@ def test_what_is_decided_is_what_deciding_every_frame_decides(speaker, asked):
     for index, row in enumerate(heard):
         ((decision, memory),) = when.decide_each([Sensed(index, row)], [memory])
         every += decision.events
-    assert decisions(when, heard, [7], asked) == [tuple(every)]
-    assert "blink" in {event.kind for event in every}
+    assert decisions(when, heard, [7], asked) == [tuple(every)] and "blink" in {event.kind for event in every}
 
 
 def test_delayed_hazards_know_a_frame_less():
@@ -154,15 +151,13 @@ def test_seeds_scatter_as_people_do_and_some_do_not_nod_in_the_demo_at_all():
     recording = AudioFile(shipped_speaker("facegood_1114_3_16").audio)
     voice = recording.read(recording.length)
     recording.close()
-    frames = len(voice) // FRAME_SAMPLES
-    when = EventModel.load()
+    frames, when = len(voice) // FRAME_SAMPLES, EventModel.load()
     _, heard = sensed(
         speaker_frames(voice[: frames * FRAME_SAMPLES], np.full((frames, 58), np.nan, np.float32)), Calmness()
     )
     counts = np.array([len(event_spans(events, "nod")) for events in decisions(when, heard, range(300), Calmness())])
     assert 3 <= counts.mean() / (frames * FRAME_S / 60) <= 7, "addressed: as many a minute as people's"
-    assert 1.28 <= counts.var(ddof=1) / counts.mean() <= 1.82
-    assert 0.03 <= (counts == 0).mean() <= 0.15
+    assert 1.28 <= counts.var(ddof=1) / counts.mean() <= 1.82 and 0.03 <= (counts == 0).mean() <= 0.15
 
 
 def test_what_annotators_saw_is_what_hazards_were_taught_on(tmp_path):

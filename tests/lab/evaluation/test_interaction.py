@@ -32,11 +32,9 @@ def test_confusion_counts_frames_that_have_both_and_adds_up():
 
 
 def test_a_listener_hears_the_user_one_frame_late_and_itself_at_once():
-    one = dyad("a", "interaction", 0)
-    agent, user = scores.voice_tracks(one).T
+    agent, user = scores.voice_tracks(dyad("a", "interaction", 0)).T
     speaks = np.arange(len(agent)) // HZ % 2 == 0
-    assert (agent == speaks).mean() > 0.9
-    assert (user[1:] == ~speaks[:-1]).mean() > 0.9 and not user[0]
+    assert (agent == speaks).mean() > 0.9 and (user[1:] == ~speaks[:-1]).mean() > 0.9 and not user[0]
 
 
 # --- lips -----------------------------------------------------------------------------------------------------------
@@ -81,8 +79,7 @@ def test_motion_without_chunks_has_a_ratio_of_one_and_jumps_are_seen_at_borders_
 def test_a_jaw_that_stays_open_after_speech_is_seen():
     one = dyad("a", "speaking", 0)
     assert np.isnan(scores.listening_again([one.listener], [one]))  # it never stays silent for more than a second
-    silent = dyad("b", "listening", 1)
-    still = jaw(np.full(300, 0.2))
+    silent, still = dyad("b", "listening", 1), jaw(np.full(300, 0.2))
     assert scores.listening_again([one.listener, still], [one, silent]) == pytest.approx(0.5, abs=0.05)
 
 
@@ -99,8 +96,7 @@ def test_the_agents_sound_comes_one_frame_early():
 
 # --- tables ---------------------------------------------------------------------------------------------------------
 def clips(seed: int = 0) -> np.ndarray:
-    walk = np.random.default_rng(seed).normal(size=(3, 250, 58)).cumsum(1)
-    return 0.01 * walk
+    return 0.01 * np.random.default_rng(seed).normal(size=(3, 250, 58)).cumsum(1)
 
 
 def test_the_truth_is_at_no_distance_of_itself_and_a_still_face_has_no_variance():

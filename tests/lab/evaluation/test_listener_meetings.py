@@ -48,18 +48,15 @@ def test_it_is_as_it_was(person, one):
     assert one.frames == len(one.speaker) == at(120) and one.participant == person.participant
     np.testing.assert_array_equal(one.spans_s["nod"], person.nods)
     assert len(one.spans_s["laugh"]) == 1 and one.aside.tolist() == [False, True, False]
-    voiced = voice_activity(np.concatenate([frame.audio for frame in one.speaker]))
-    assert (voiced == one.others).mean() > 0.8
+    assert (voice_activity(np.concatenate([frame.audio for frame in one.speaker])) == one.others).mean() > 0.8
     assert not one.listening[at(100) : at(110)].any() and not one.listening[at(80) : at(82)].any()
 
 
 def test_the_speaker_looks_at_him_as_annotated_and_two_at_once_speak_to_nobody(one):
     assert np.isnan(one.attention[: at(1)]).all()  # nobody has the floor yet
-    assert (one.attention[at(1.1) : at(1.9)] == 1).all()
-    assert (one.attention[at(61.5) : at(61.9)] == 0).all()
+    assert (one.attention[at(1.1) : at(1.9)] == 1).all() and (one.attention[at(61.5) : at(61.9)] == 0).all()
     assert [frame.attention for frame in one.speaker[at(2) : at(2) + 3]] == [1.0, 1.0, 1.0]
-    assert all(frame.face is not None for frame in one.speaker)
-    assert one.alone[at(1.5)] and not one.alone[at(2.2)]
+    assert all(frame.face is not None for frame in one.speaker) and one.alone[at(1.5)] and not one.alone[at(2.2)]
     assert one.addressed[at(1.5)] and not one.addressed[at(2.2)]
     assert one.bystander[at(66.5)] and not one.addressed[at(66.5)]
 

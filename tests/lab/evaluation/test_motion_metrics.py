@@ -15,8 +15,7 @@ N, K, T = 3, 2, 80
 
 
 def motion(seed: int, *shape: int) -> np.ndarray:
-    drawn = np.random.default_rng(seed)
-    return np.clip(0.3 + drawn.normal(0, 0.02, shape).cumsum(-2), 0, 1)
+    return np.clip(0.3 + np.random.default_rng(seed).normal(0, 0.02, shape).cumsum(-2), 0, 1)
 
 
 @pytest.fixture
@@ -36,15 +35,10 @@ def test_rows_are_the_metrics_of_the_package_averaged_over_the_answers(arrays: d
     assert (result["space"], result["clips"], result["frames"], result["samples"]) == ("arkit58", N, T, K)
     truth, answers = np.load(arrays["truth"])[..., 6:], np.load(arrays["prediction"])[..., 6:]
     found = values(result, "expression")
-    assert found["L2: distance over channels"] == pytest.approx(
-        np.mean([metrics.l2(truth, answers[:, k]) for k in range(K)])
-    )
-    assert found["FD: of all frames"] == pytest.approx(
-        np.mean([metrics.frechet_distance(truth, answers[:, k]) for k in range(K)])
-    )
-    assert values(result, "all")["FRDiv: between answers"] == pytest.approx(
-        metrics.frdiv(np.load(arrays["prediction"]))
-    )
+    l2, fd = (np.mean([way(truth, answers[:, k]) for k in range(K)]) for way in (metrics.l2, metrics.frechet_distance))
+    assert (found["L2: distance over channels"], found["FD: of all frames"]) == pytest.approx((l2, fd))
+    answers = np.load(arrays["prediction"])
+    assert values(result, "all")["FRDiv: between answers"] == pytest.approx(metrics.frdiv(answers))
 
 
 def test_truth_beside_itself_is_without_distance_and_moves_as_often(arrays: dict[str, Path]) -> None:

@@ -131,8 +131,7 @@ def test_what_cannot_be_compared_is_said_before_anything_is_made(tmp_path, condi
 def test_clips_are_made_once(tmp_path):
     options = options_for(tmp_path, ("sfms-small", "arig-small"), voices=2)
     made = prepare(**options)
-    shown = made.next("me")
-    motion = np.fromfile(made.clips / shown["left"], "<f4").reshape(-1, 58)
+    motion = np.fromfile(made.clips / made.next("me")["left"], "<f4").reshape(-1, 58)
     assert motion.shape == (50, 58) and np.isfinite(motion).all() and np.ptp(motion, axis=0).max() > 0.01
     files = {file.name: file.stat().st_mtime_ns for file in made.clips.iterdir()}
     prepare(**options)

@@ -53,8 +53,7 @@ def test_rounds_come_to_rest(model):
 def nodding(sizes_rad) -> Dyad:
     """One that is told of its nods, each of its size, in two swings of which the second is 0.6 of the first."""
     motion = np.zeros((50 * (len(sizes_rad) + 1), 58), np.float32)
-    swing = 0.5 - 0.5 * np.cos(np.linspace(0, 2 * np.pi, 21))[1:]
-    nods = []
+    swing, nods = 0.5 - 0.5 * np.cos(np.linspace(0, 2 * np.pi, 21))[1:], []
     for number, size in enumerate(sizes_rad):
         at = 25 + 50 * number
         motion[at : at + 40, CHANNEL_INDEX["pitch"]] = size * np.concatenate([swing, 0.6 * swing])
@@ -83,8 +82,7 @@ def test_how_nods_die_away_is_found_at_every_size_and_not_of_single_swings():
 def smiling(count: int) -> Dyad:
     """Smiles of many sizes, of 3 s: straight up within 0.96 s, straight down in the last 0.96 s."""
     motion = np.zeros((100 * (count + 1), 58), np.float32)
-    times_s = (1 + np.arange(len(motion))) * 0.04
-    smiles = []
+    times_s, smiles = (1 + np.arange(len(motion))) * 0.04, []
     for number in range(count):
         event = ListenerEvent("smile", 1.0 + 4 * number, 3.0, 0.3 + 0.02 * number)
         knots_s = np.array([event.start_s, event.start_s + 0.96, event.end_s - 0.96, event.end_s])
@@ -100,6 +98,5 @@ def test_the_course_of_smiles_is_found_at_every_size_and_not_of_too_few():
     np.testing.assert_allclose(found.rise, np.array(found.RISE_S) / 0.96, atol=2e-3)
     np.testing.assert_allclose(found.fall, np.array(found.FALL_S) / 0.96, atol=2e-3)
     assert found.spread == 0.1
-    assert coursed(asked, [smiling(LEAST - 1)]) == asked
-    assert coursed(asked, []) == asked
+    assert coursed(asked, [smiling(LEAST - 1)]) == asked and coursed(asked, []) == asked
     assert coursed(told_settings(), [smiling(LEAST)]) == told_settings()

@@ -49,8 +49,7 @@ def ends_of(others):
 
 def answering(others, share=0.4, seed=0):
     """Nods of somebody who answers a share of the phrases 0.2 to 0.7 s after their end."""
-    rng = np.random.default_rng(seed)
-    ends = ends_of(others)
+    rng, ends = np.random.default_rng(seed), ends_of(others)
     return (ends + rng.uniform(0.2, 0.7, len(ends)))[rng.random(len(ends)) < share]
 
 
@@ -123,8 +122,7 @@ def test_what_a_finder_misses_is_made_up_for():
     half = DetectorCalibration({"nod": Sightings(np.ones(4), np.array([1.0, 1, 0, 0]), 2, np.full(2, 0.08))})
     detected = [Detected.of(each) for each in motion]
     plain, made_up = (timing.motion_sums(one, motion, detected, 0, known) for known in (DetectorCalibration({}), half))
-    assert plain["nods_per_minute"][0] > 0
-    assert made_up["nods_per_minute"][0] == 2 * plain["nods_per_minute"][0]
+    assert plain["nods_per_minute"][0] > 0 and made_up["nods_per_minute"][0] == 2 * plain["nods_per_minute"][0]
     assert plain["blinks_per_minute"].tolist() == [0, pytest.approx(2.0)]
 
 
@@ -199,8 +197,7 @@ def test_people_who_were_trained_on_are_refused_unless_asked_for_and_a_part_with
 
 def test_meetings_are_spread_evenly_and_played_from_their_middle():
     people = list(range(134))
-    assert spread(people, 3) == [0, 66, 133]
-    assert spread(people, None) == spread(people, 500) == people
+    assert spread(people, 3) == [0, 66, 133] and spread(people, None) == spread(people, 500) == people
     assert (middle(30_000, 5.0), middle(100, 5.0), middle(100, 0.0)[1]) == ((11_250, 7_500), (0, 100), 0)
 
 

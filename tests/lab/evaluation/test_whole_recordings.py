@@ -38,8 +38,7 @@ def speaker():
 @pytest.fixture(scope="module")
 def history():
     """Of every kind some, one after the other; looks aside and back; some begin as a frame ends."""
-    rng = np.random.default_rng(5)
-    events = []
+    rng, events = np.random.default_rng(5), []
     for kind in EVENT_KINDS:
         for number, start_s in enumerate(np.sort(rng.uniform(0, FRAMES * FRAME_S, 12)).round(2)):
             target = None if kind != "gaze_shift" else (0.3, 0.0) if number % 2 == 0 else (0.0, 0.0)
@@ -73,8 +72,7 @@ def test_a_scene_without_a_microphone_hears_with_its_eyes_and_nothing_is_asked_o
     for frames in (0, 1, 2):
         found = hazards_in(model, np.full((frames, len(HEARD)), np.nan), [], Calmness())
         assert {len(values) for values in found.values()} == {frames}
-        blind = Sensed(0, np.full(len(HEARD), np.nan))
-        assert not model.decide_each([blind], [model.start(0)])[0][0].events
+        assert not model.decide_each([Sensed(0, np.full(len(HEARD), np.nan))], [model.start(0)])[0][0].events
 
 
 @pytest.mark.parametrize("calmness", CALMNESS)
@@ -89,8 +87,7 @@ def test_hazards_are_those_asked_frame_by_frame(rows, history, calmness):
 
 
 def test_no_history_makes_anything_likelier_than_the_most(rows, history):
-    model = EventModel.load()
-    heard = np.stack([one.heard for one in rows])
+    model, heard = EventModel.load(), np.stack([one.heard for one in rows])
     steps = steps_in(FRAMES)
     for calmness in CALMNESS:
         most = most_in(model, heard[steps], calmness)

@@ -149,9 +149,7 @@ def test_a_pack_trains_what_its_folder_trains(data, pack, tmp_path):
 def test_a_pack_of_another_version_or_listener_or_no_pack_is_refused_in_one_line(pack, tmp_path):
     old = tmp_path / "old.pack"
     save_file({"x": torch.zeros(1)}, old, {"pack": '{"version": 7}'})
-    with pytest.raises(
-        ConfigError, match="^.*old.pack: version: expected 1, got 7; pack again: sfms-robot train pack$"
-    ):
+    with pytest.raises(ConfigError, match="^.*old.pack: version: expected 1, got 7; pack again: .*train pack$"):
         train_arig(settings(TOLD), old, tmp_path / "out")
     with pytest.raises(ConfigError, match="^.*told.pack: events: expected False, got True; pack again"):
         train_arig(settings(), pack[1], tmp_path / "out")

@@ -28,8 +28,7 @@ def test_the_quantization_term_counts_keyframes_of_their_own_group_only():
 
 def test_masking_is_the_distance_to_the_best_mask():
     best = torch.tensor([1.0, 0.0, 1.0])[None, :, None]
-    assert masking(best, best) == 0
-    assert masking(1 - best, best) == 3
+    assert masking(best, best) == 0 and masking(1 - best, best) == 3
 
 
 def test_next_token_loss_is_weighted_cross_entropy_of_the_counted_frames():

@@ -18,8 +18,7 @@ def bumps(count: int, frames: int = 24, seed: int = 0) -> torch.Tensor:
     drawn = torch.Generator().manual_seed(seed)
     at = torch.rand(count, 1, generator=drawn) * (frames - 8) + 4
     width = 1.5 + 2 * torch.rand(count, 1, generator=drawn)
-    rise = ((torch.arange(frames) - at) / width).clamp(-1, 1)
-    return (0.5 + 0.5 * torch.cos(math.pi * rise))[..., None]
+    return (0.5 + 0.5 * torch.cos(math.pi * ((torch.arange(frames) - at) / width).clamp(-1, 1)))[..., None]
 
 
 def score_network() -> ConditionalScore:
@@ -28,15 +27,11 @@ def score_network() -> ConditionalScore:
 
 
 def test_what_is_best_has_no_regret_and_following_the_teacher_ends_at_the_best_mask():
-    track = tracks(bumps(4), ONE, 1)
-    chosen = torch.zeros(4, 24)
+    track, chosen = tracks(bumps(4), ONE, 1), torch.zeros(4, 24)
     chosen[:, 3] = 1.0
     regret = regrets(track, chosen, torch.full((4,), 5), 5)
-    assert regret[:, 3].isinf().all()
-    assert (regret >= 0).all()
-    assert (regret.amin(1) < 1e-5).all()
-    track = tracks(torch.randn(6, 24, 1).cumsum(1), ONE, 1)
-    mask = torch.zeros(6, 24)
+    assert regret[:, 3].isinf().all() and (regret >= 0).all() and (regret.amin(1) < 1e-5).all()
+    track, mask = tracks(torch.randn(6, 24, 1).cumsum(1), ONE, 1), torch.zeros(6, 24)
     for _ in range(5):
         regret = regrets(track, mask, torch.full((6,), 5), 5)
         mask = mask.scatter(1, regret.argmin(1, keepdim=True), 1.0)
@@ -46,8 +41,7 @@ def test_what_is_best_has_no_regret_and_following_the_teacher_ends_at_the_best_m
 
 def test_states_are_those_of_one_choice_each():
     score, drawn = score_network(), torch.Generator().manual_seed(1)
-    track = tracks(bumps(3), ONE, 1)
-    k = torch.tensor([1, 4, 2])
+    track, k = tracks(bumps(3), ONE, 1), torch.tensor([1, 4, 2])
     rows, chosen, remaining = states(score, track, k, drawn)
     assert rows.bincount().tolist() == k.tolist()
     for row, count, coming in zip(rows.tolist(), chosen.sum(1).tolist(), remaining.tolist(), strict=True):
@@ -66,8 +60,7 @@ def test_lively_tracks_are_drawn_before_still_ones():
     motion = torch.zeros(8, 24, 2)
     motion[..., 1] = torch.randn(8, 24) * 3
     found = lively(motion, torch.eye(2), 1, 4, torch.Generator().manual_seed(0))
-    assert len(found.curves) == 4
-    assert (found.curves.square().sum((1, 2)) > 1).sum() >= 3
+    assert len(found.curves) == 4 and (found.curves.square().sum((1, 2)) > 1).sum() >= 3
 
 
 @pytest.mark.slow
@@ -79,8 +72,7 @@ def test_scores_that_learned_from_the_teacher_beat_even_keyframes_on_unseen_moti
         imitation(score, tracks(bumps(16, seed=step + 1), ONE, 1), 5, drawn).backward()
         optimizer.step()
     unseen = bumps(100, seed=999)
-    track = tracks(unseen, ONE, 1)
-    k = torch.full((100,), 4)
+    track, k = tracks(unseen, ONE, 1), torch.full((100,), 4)
     even = mask_cost(track.cost, place_static(unseen, [4])[..., 0]).sum()
     assert mask_cost(track.cost, choose(score, track, k)).sum() < 0.5 * even
 

@@ -50,8 +50,7 @@ def powers(mixture: torch.Tensor) -> torch.Tensor:
 def test_what_is_fitted_on_sway_is_its_amplitudes():
     hz = torch.tensor(BANDS_HZ)
     amplitude = torch.linspace(0.02, 0.004, len(hz) - 1)[:, None] * torch.tensor([1.0, 0.5])
-    people = swaying(torch.diag_embed(amplitude), 80)
-    found, spread = sway_of(people)
+    found, spread = sway_of(swaying(torch.diag_embed(amplitude), 80))
     torch.testing.assert_close(powers(found)[1:], amplitude[1:].square(), rtol=0.5, atol=2e-6)
     assert 0.2 < float(spread) < 0.5  # that of 0.3, and of how much each is seen to sway in four minutes
 
@@ -61,8 +60,7 @@ def test_what_is_fitted_on_sway_is_its_amplitudes():
 def test_what_channels_do_together_is_found_on_either_side_of_the_mirror(lateral):
     """Two channels that go opposite ways, the second one lateral or not; the third by itself."""
     together = torch.tensor([[0.01, 0.0, 0.0], [-0.008, 0.006, 0.0], [0.0, 0.0, 0.005]])
-    people = swaying(together.expand(len(BANDS_HZ) - 1, 3, 3), 60, lateral)
-    found, _ = sway_of(people, lateral)
+    found, _ = sway_of(swaying(together.expand(len(BANDS_HZ) - 1, 3, 3), 60, lateral), lateral)
     covariance = (found @ found.mT).sum(0)
     r = covariance / covariance.diagonal().sqrt() / covariance.diagonal().sqrt()[:, None]
     assert abs(float(r[0, 1])) == pytest.approx(0.8, abs=0.1) and abs(float(r[0, 2])) < 0.15

@@ -57,8 +57,7 @@ def settings(**predictor) -> config.Training:
 
 def dyad(name: str = "a", frames: int = 500, seed: int = 0) -> Dyad:
     """A head that sways, looks aside and nods; eyes that look about."""
-    rng = np.random.default_rng(seed)
-    times_s = (1 + np.arange(frames)) * 0.04
+    rng, times_s = np.random.default_rng(seed), (1 + np.arange(frames)) * 0.04
     motion = np.zeros((frames, 58), np.float32)
     motion[:, :3] = 0.01 * np.sin(2 * np.pi * 0.1 * times_s + rng.uniform(0, 6, 3)[:, None]).T
     head = np.zeros((frames, 3), np.float32)
@@ -92,8 +91,7 @@ def test_motion_and_sway_of_a_dyad_are_its_motion_without_gaze():
     frames = frames_of(one, ARKIT, None, listener)
     np.testing.assert_allclose(frames.motion[:, :6] + frames.sway, without_gaze(one).listener[:, :6], atol=1e-6)
     np.testing.assert_array_equal(frames.control, control_track(one.events, 0, 500))
-    resting = control_track(one.events, -6, 512)[:, 0].astype(bool)
-    near_nod = np.convolve(resting, np.ones(13), "valid") > 0
+    near_nod = np.convolve(control_track(one.events, -6, 512)[:, 0].astype(bool), np.ones(13), "valid") > 0
     assert np.ptp(frames.motion[:, 1].numpy()) == pytest.approx(0.1, rel=0.1)
     assert float(frames.motion[:, :6][~near_nod].abs().max()) < 0.004  # nothing for a keyframe to do
 
@@ -185,8 +183,7 @@ def test_a_stream_that_has_just_begun_was_told_of_nothing_before():
 def test_keyframes_are_missed_only_where_that_is_worth_one_and_are_made_up_for_at_once():
     tokens = torch.zeros(2, 48, 2).long()
     tokens[:, 5], tokens[:, 38, 0], tokens[:, 39, 1] = 1, 7, 3
-    dense = torch.full_like(tokens, 9)
-    motion = torch.zeros(2, 48, 4)
+    dense, motion = torch.full_like(tokens, 9), torch.zeros(2, 48, 4)
     motion[0, 38:, :2] = 2.0  # of the first group, in the first window: it has moved since frame 5
     member = torch.tensor([[1.0, 1, 0, 0], [0, 0, 1, 1]])
     arguments = dense, motion, torch.tensor([42, 42]), member, torch.tensor([1.0, 1.0])
@@ -205,8 +202,7 @@ def test_both_phases_learn_to_nod_when_they_are_told(tmp_path):
     tokenizer_trainer.train_tokenizer(chosen, tmp_path / "data", tmp_path / "out")
     predictor_trainer.train_listener(chosen, tmp_path / "data", tmp_path / "out")
     calibrate(chosen, tmp_path / "data", tmp_path / "out")
-    unseen = dyad("c", seed=2)
-    listener = load_folder(tmp_path / "out")
+    unseen, listener = dyad("c", seed=2), load_folder(tmp_path / "out")
     (told,) = rollouts(listener, [unseen], seed=1)
     (quiet,) = rollouts(listener, [replace(unseen, events=())], seed=1)
     people = unseen.listener[:, 1]

@@ -95,8 +95,7 @@ def test_resumed_from_a_checkpoint_before_a_crash_equals_left_alone(left_alone, 
     with pytest.raises(RuntimeError):
         fit(toy(evaluate_every=3, checkpoint_every=every), tmp_path, Run(watches=(crash,)))
     job = toy(evaluate_every=3)  # how often to save is no part of what a run is
-    outcome = fit(job, tmp_path, Run(resume=True))
-    assert outcome.resumed_at == 8 // every * every
+    assert fit(job, tmp_path, Run(resume=True)).resumed_at == 8 // every * every
     assert same(weights(job), left_alone[0])
 
 
@@ -109,8 +108,7 @@ def test_looking_at_the_held_out_loss_changes_no_weight(tmp_path):
 
 
 def test_minutes_alone_make_checkpoints(tmp_path):
-    seconds = iter(range(0, 10_000, 40))
-    steps_saved = []
+    seconds, steps_saved = iter(range(0, 10_000, 40)), []
 
     def look(report):
         left = peek(checkpoint_file(tmp_path, "toy"))
@@ -121,8 +119,7 @@ def test_minutes_alone_make_checkpoints(tmp_path):
 
 
 def test_patience_stops_early_and_keeps_the_best_weights(tmp_path):
-    errors = iter([5.0, 3.0, 4.0, 3.5, 9.0])
-    at_best = []
+    errors, at_best = iter([5.0, 3.0, 4.0, 3.5, 9.0]), []
     job = toy(held_out=lambda: next(errors), evaluate_every=2, patience=2)
 
     def remember(report):
@@ -138,8 +135,7 @@ def test_a_finished_run_resumes_into_its_weights_without_a_step(tmp_path):
     first = toy(evaluate_every=3)
     done = fit(first, tmp_path)
     again = toy(evaluate_every=3, loss=lambda step, loss: pytest.fail("a step was made"))
-    outcome = fit(again, tmp_path, Run(resume=True))
-    assert outcome == replace(done, resumed_at=12)
+    assert fit(again, tmp_path, Run(resume=True)) == replace(done, resumed_at=12)
     assert same(weights(first), weights(again))
 
 
@@ -224,8 +220,7 @@ def test_a_folder_that_vanishes_is_one_line(tmp_path):
 
 
 def test_gradients_are_clipped_for_each_optimizer(tmp_path):
-    seen = []
-    job = toy(loss=lambda step, loss: 1000 * loss, clip_norm=0.5)
+    seen, job = [], toy(loss=lambda step, loss: 1000 * loss, clip_norm=0.5)
 
     def look(report):
         seen.append(report.gradient_norm)

@@ -71,8 +71,7 @@ def test_evidence_of_a_meeting_is_what_was_said():
     scene, listening = meeting_scene(person())
     share = np.diff(words(0), axis=1).sum() / UNTIL_S
     assert scene.speaks[:, 1].mean() == pytest.approx(share, rel=0.03)
-    assert not scene.speaks[:, 0].any() and np.isnan(scene.looks).all()
-    assert listening[scene.speaks[:, 1]].all()
+    assert not scene.speaks[:, 0].any() and np.isnan(scene.looks).all() and listening[scene.speaks[:, 1]].all()
 
 
 def test_who_nods_behind_phrases_is_learned_to_and_a_random_one_is_not():
@@ -99,8 +98,7 @@ def test_what_is_written_down_scores_as_what_was_fitted():
 
 def test_nothing_later_is_known_as_a_step_begins():
     whole, cut = student(person(answering()), np.random.default_rng(0)), words(0)
-    early = person(answering()[:10], cut[cut[:, 1] < 300])
-    other = student(early, np.random.default_rng(0))
+    other = student(person(answering()[:10], cut[cut[:, 1] < 300]), np.random.default_rng(0))
     steps = int(min(answering()[10, 0], 299.0) / 0.08)
     annotated = [at for name, at in AT.items() if name not in ("smile_end_s", "brow_raise_end_s")]
     np.testing.assert_array_equal(whole.evidence[:steps, annotated], other.evidence[:steps, annotated])
@@ -116,8 +114,7 @@ def test_a_look_away_is_from_somebody_who_speaks():
 
 
 def test_counts_of_a_person_are_his_own():
-    one = student(person(answering()), np.random.default_rng(0))
-    found, _ = event_trainer.count(one, answering()[:, 0])
+    found, _ = event_trainer.count(student(person(answering()), np.random.default_rng(0)), answering()[:, 0])
     assert found["nods_per_minute"][0] == len(answering())
     ratio = event_trainer.figures(found)["phrase_end_ratio"]
     assert ratio > 3 or np.isnan(ratio)
@@ -152,5 +149,4 @@ def test_smiles_last_as_long_as_composed_ones_and_what_is_saved_is_loaded(tmp_pa
     for kind, (least, most) in {"smile": (2.5, 4.5), "laugh": (2.5, 4.5)}.items():
         assert least < np.median(shipped.shapes[kind].duration_s) < most
     save(tmp_path / "events.yaml", shipped)
-    assert load_tables(tmp_path / "events.yaml") == shipped
-    assert "Carletta" in (tmp_path / "events.yaml").read_text()
+    assert load_tables(tmp_path / "events.yaml") == shipped and "Carletta" in (tmp_path / "events.yaml").read_text()
