@@ -14,7 +14,6 @@ from websockets.sync.client import connect
 
 from sfms_robot.app.listen.demo import compare_seeds, demo, free_folder, next_speaker, nods_over_seeds
 from sfms_robot.app.options import RunOptions, begin_page
-from sfms_robot.data import speaker_names
 from sfms_robot.errors import install_command
 
 SHORT = RunOptions(head="op3_head", duration_s=1.0, fast=True)
@@ -57,11 +56,6 @@ def test_while_a_visitor_is_there_the_bundled_people_talk_one_after_the_other(tm
     assert json.loads((tmp_path / "demo" / "report.json").read_text())["exit"] == "done"  # of the first
 
 
-def test_bundled_people_take_turns_and_the_first_follows_a_visitor():
-    names = speaker_names()
-    assert [next_speaker(name) for name in names] == [*names[1:], names[0]] and next_speaker("browser") == names[0]
-
-
 def elsewhere(folder, *words):
     """Run a command where `tests/elsewhere` is the computer; return the object that it prints."""
     done = subprocess.run(
@@ -76,18 +70,6 @@ def elsewhere(folder, *words):
 def test_a_head_receives_the_same_bytes_over_tcp_as_over_a_pseudo_terminal(tmp_path, command_line):
     words = ("run", "--fast", "--duration", "1", "--head", "reachy_mini", "--audio", "katie")
     assert elsewhere(tmp_path, *words)["wire"] == command_line(*words, "--json").told["wire"]
-
-
-@pytest.mark.slow
-def test_a_recording_of_an_earlier_demo_is_replaced_only_when_told(tmp_path, command_line):
-    words = ("demo", "--fast", "--head", "op3_head", "--duration", 1, "--json", "--out", tmp_path / "shown")
-    assert command_line(*words).code == 0
-    before = (tmp_path / "shown" / "run.mcap").read_bytes()
-    again = command_line(*words, "--seed", 2)
-    assert again.code == 2 and "holds a recording already" in again.err and "--overwrite" in again.err
-    assert (tmp_path / "shown" / "run.mcap").read_bytes() == before
-    assert command_line(*words, "--seed", 2, "--overwrite").code == 0
-    assert (tmp_path / "shown" / "run.mcap").read_bytes() != before
 
 
 def test_a_second_demo_writes_beside_the_first(tmp_path):

@@ -25,8 +25,7 @@ TUNED = {"baud": 1_000_000, "return_delay_us": 0.0, "latency_ms": 1.0}
 
 @given(servos=st.integers(1, 40), read=st.integers(1, 20), write=st.sampled_from([2, 4]))
 def test_bytes_are_those_of_the_packets(servos, read, write):
-    ids = bytes(range(1, servos + 1))
-    head = bytes([116, 0, write, 0])
+    ids, head = bytes(range(1, servos + 1)), bytes([116, 0, write, 0])
     goals = dxl2.encode_instruction(
         dxl2.BROADCAST, dxl2.SYNC_WRITE, head + b"".join(bytes([i]) + bytes(write) for i in ids)
     )

@@ -42,14 +42,9 @@ class Patient:
     def examined(self, rate_hz: float = 100.0, fix=None, port=None, **line) -> dict:
         """`line`: what else is known of the port than that it is a face's."""
         usual = Line(
-            bus="face",
-            device=self.chain.device,
-            shown="/dev/ttyUSB0",
-            family="dynamixel2",
-            baud=BAUD,
-            rate_hz=rate_hz,
-            wanted=self.wanted,
-        )
+            bus="face", device=self.chain.device, shown="/dev/ttyUSB0", family="dynamixel2", baud=BAUD,
+            rate_hz=rate_hz, wanted=self.wanted,
+        )  # fmt: skip
         open_port = port or (lambda device, baud: self.port(baud))
         return examine_line(replace(usual, **line), self.clock, open_port, fix=fix)
 
@@ -246,8 +241,7 @@ def test_every_model_that_has_a_map_can_be_examined(family):
             for i, model in enumerate(models, 1)
         }
         report = sick.examined(10.0, family=family, wanted=wanted)
-    assert told(report, "error") == []
-    assert [row["model"] for row in report["servos"]] == models
+    assert told(report, "error") == [] and [row["model"] for row in report["servos"]] == models
     fast = report["budget"] and report["budget"]["fast"]
     assert family == "dynamixel2" or (fast, report["fast_sync_read"]) == (None, None)
     assert all(row["voltage_V"] and row["faults"] == "" for row in report["servos"])
@@ -283,9 +277,7 @@ def test_a_maestro_answers_where_its_crc_setting_is_that_of_the_heads_file(store
         assert told(report, "error") == []
     else:
         (problem,) = told(report, "error")  # the line of a run
-        assert (
-            f"expects {'a' if stored else 'no'} CRC: set crc: {'true' if stored else 'false'} for this bus" in problem
-        )
+        assert f"expects {'a' if stored else 'no'} CRC: set crc: {str(bool(stored)).lower()} for this bus" in problem
         assert "Enable CRC" in fix_of(report, "CRC")
 
 
@@ -371,8 +363,7 @@ def test_every_command_that_is_proposed_is_one_that_the_program_has():
     assert len(proposed) >= 4
     for text in proposed:
         words = shlex.split(text.replace("OLD", "1").replace("NEW", "2"))
-        group = root.commands[words[0]]
-        group.commands[words[1]].make_context(words[1], words[2:], resilient_parsing=False)
+        root.commands[words[0]].commands[words[1]].make_context(words[1], words[2:], resilient_parsing=False)
 
 
 @pytest.mark.parametrize("where", [{"port": "sim", "head": None}, {"port": "/dev/null", "head": "reachy_mini"}])

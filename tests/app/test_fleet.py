@@ -27,10 +27,8 @@ def run():
 
 
 def test_halt_names_who_asked_and_resume_lets_go(run):
-    assert run.obey(command="halt", by="  kitchen\n") == {"done": "halt"}
-    assert run.halt.by == "kitchen"
-    assert run.obey(command="resume") == {"done": "resume"}
-    assert run.halt.by is None
+    assert run.obey(command="halt", by="  kitchen\n") == {"done": "halt"} and run.halt.by == "kitchen"
+    assert run.obey(command="resume") == {"done": "resume"} and run.halt.by is None
     run.obey(command="end")
     assert run.interrupt()
 
@@ -86,8 +84,7 @@ def test_a_key_is_made_for_its_owner_alone_and_one_that_others_can_read_is_refus
 
 
 def test_calm_and_knobs_are_turned(run):
-    assert run.obey(command="calm", rates={"nod": 3.0}) == {"done": "calm"}
-    assert run.calmed[0].nod == 3.0
+    assert run.obey(command="calm", rates={"nod": 3.0}) == {"done": "calm"} and run.calmed[0].nod == 3.0
     region = next(iter(run.knobs))
     assert run.obey(command="knobs", intensity={region: 0.5}) == {"done": "knobs"}
     assert run.knobs[region].intensity == 0.5
@@ -116,8 +113,7 @@ def test_what_cannot_be_obeyed_is_one_line(run, command, said):
      b'{"command": "knobs", "intensity": {"neck": 1' + 400 * b"0" + b"}}"],
 )  # fmt: skip
 def test_nonsense_is_answered_and_does_nothing(run, message):
-    controls = FleetControls(run.halt, run.interrupt, run.knobs, None)
-    assert "error" in controls.obey(message)
+    assert "error" in FleetControls(run.halt, run.interrupt, run.knobs, None).obey(message)
     assert run.halt.by is None and not run.interrupt()
 
 

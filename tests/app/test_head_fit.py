@@ -44,8 +44,7 @@ def test_held_out_faces_come_three_times_nearer(seed, record_property):
 
     test = shapes[held_out]
     told, skin = asked(head, test), fitting.skin_motion()
-    best = ideal.face(told)
-    errors = {}
+    best, errors = ideal.face(told), {}
     for name, candidate in (("before", head), ("after", fitted)):
         face = tracker.face(asked(candidate, test))
         missed = face - best
@@ -58,11 +57,9 @@ def test_held_out_faces_come_three_times_nearer(seed, record_property):
 
 def test_the_virtual_face_without_a_skin_of_its_own_looks_as_asked():
     head = load_head("face28")
-    shapes = recorded_shapes()[::5]
-    told = asked(head, shapes)
+    told = asked(head, recorded_shapes()[::5])
     face = fitting.Tracker(head).face(told)
-    assert face.min() >= 0 and face.max() <= 1
-    assert rms(looks_like(head, face) - told) < 0.01
+    assert face.min() >= 0 and face.max() <= 1 and rms(looks_like(head, face) - told) < 0.01
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +80,7 @@ def test_babbling_keeps_to_the_limits_and_is_learnt_from(babbled, monkeypatch, t
     json.dumps(result)
     head = load_head("inmoov2_maestro")
     practice = overlay_file(head.name, practice=True)
-    assert load_overlay(head, practice).fit is not None
-    assert not overlay_file(head.name).exists()
+    assert load_overlay(head, practice).fit is not None and not overlay_file(head.name).exists()
     assert result["practice"] and result["file"] == str(practice)
 
 
@@ -101,10 +97,8 @@ def test_what_is_no_recording_of_this_face_is_told(babbled, tmp_path):
 
 def test_random_faces_begin_and_end_at_rest_and_stay_faces():
     faces = fitting.random_faces([0, 5, 9], 30.0, seed=1)
-    times_s = np.arange(0, faces.duration_s, 0.01)
-    motion, _ = faces.sample(times_s, 0.0, None)
-    assert not motion[0].any() and np.abs(motion[-1]).max() < 0.01
-    assert motion.min() >= 0 and motion.max() <= 1
+    motion, _ = faces.sample(np.arange(0, faces.duration_s, 0.01), 0.0, None)
+    assert not motion[0].any() and np.abs(motion[-1]).max() < 0.01 and motion.min() >= 0 and motion.max() <= 1
     assert np.flatnonzero(motion.any(axis=0)).tolist() == [6, 11, 15]
     assert np.abs(np.diff(motion, axis=0)).max() < 0.05
 

@@ -53,9 +53,7 @@ def test_lerobot_ticks_become_degrees_around_its_half_turn(tmp_path):
     head, remarks = imported(tmp_path, "lamp.json", LEROBOT)
     yaw, jaw = head.joints["base_yaw"], head.joints["jaw"]
     assert (head.buses["main"].family, yaw.model, yaw.zero_ticks) == ("feetech", "sts3215", 2047)
-    assert (yaw.min_deg, yaw.max_deg) == pytest.approx(
-        ((1100 - 2047) * 360 / 4096, (3050 - 2047) * 360 / 4096), abs=0.01
-    )
+    assert (yaw.min_deg, yaw.max_deg) == pytest.approx((-947 * 360 / 4096, 1003 * 360 / 4096), abs=0.01)
     assert head.safety_of("base_yaw").stored == {"homing_offset": -612}
     assert jaw.sign == -1 and jaw.drive.gain == -1  # LeRobot negates it; it opens to its longer side
     assert head.calibrate_first and any("sts3215 is assumed" in remark for remark in remarks)

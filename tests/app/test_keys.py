@@ -88,8 +88,7 @@ class Shown:
         raise AssertionError(f"it was never stopped: {self.text[-500:]!r}")
 
     def single_keys(self):
-        local = termios.tcgetattr(self.far)[3]
-        return not local & (termios.ICANON | termios.ECHO)
+        return not termios.tcgetattr(self.far)[3] & (termios.ICANON | termios.ECHO)
 
 
 def test_keys_halt_resume_help_and_end():
@@ -109,8 +108,7 @@ def test_keys_halt_resume_help_and_end():
         shown.until("torque off at once")
         shown.press(b"xqq")  # one that is held down asks once
         shown.until(SHOW)
-        assert shown.process.wait(LIMIT_S) == 0
-        assert termios.tcgetattr(shown.far) == shown.usual
+        assert shown.process.wait(LIMIT_S) == 0 and termios.tcgetattr(shown.far) == shown.usual
 
 
 def test_a_resume_that_is_refused_is_answered_on_the_terminal():
@@ -139,8 +137,7 @@ def test_however_it_ends_the_terminal_is_as_it_was(note, how, code):
         shown.until("? help")
         how(shown)
         shown.until(SHOW)
-        assert shown.process.wait(LIMIT_S) in (code, -signal.SIGINT)
-        assert termios.tcgetattr(shown.far) == shown.usual
+        assert shown.process.wait(LIMIT_S) in (code, -signal.SIGINT) and termios.tcgetattr(shown.far) == shown.usual
 
 
 def test_a_keyboard_that_was_left_is_not_taken_again():

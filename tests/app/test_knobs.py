@@ -54,8 +54,7 @@ def test_all_regions_are_turned_together_and_none_leaves_its_range():
     for _ in range(30):
         knobs.turn_all(-0.1)
     assert set(knobs.values["intensity"].values()) == {0.0}
-    face = np.full(MOTION_DIM, 0.2, dtype=np.float32)
-    angles, _ = RETARGETER.step(face, RETARGETER.start(), knobs.now)
+    angles, _ = RETARGETER.step(np.full(MOTION_DIM, 0.2, dtype=np.float32), RETARGETER.start(), knobs.now)
     assert angles == pytest.approx(build_motion(HEAD, 100.0).rest_rad, abs=0.02)
 
 

@@ -52,8 +52,7 @@ def test_it_says_what_the_document_says():
 
 
 def test_it_shows_the_end_the_beginning_faults_hours_virtual_time_and_ascii():
-    assert "stopping" in drawn(status(), ending=True)
-    assert "starting" in drawn(RunStatus(JOINTS, {}).document())
+    assert "stopping" in drawn(status(), ending=True) and "starting" in drawn(RunStatus(JOINTS, {}).document())
     assert "and 2 more" in drawn(status(faults=JOINTS))
     assert "2:00:05 of 3:00:00" in drawn({**status(), "time_s": 7205.4, "duration_s": 10800.0})
     late = {"tick": {"target_hz": 100.0, "achieved_hz": None, "late": None}}

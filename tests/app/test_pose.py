@@ -28,8 +28,7 @@ def test_every_expression_is_made_of_channels_in_their_range(word):
 def test_later_words_go_over_earlier_ones_and_the_face_rises_stays_and_falls():
     motion = parse_face(["smile", "mouthSmileLeft=0.1", "yaw=-0.5"])
     assert motion[CHANNEL_INDEX["mouthSmileLeft"]] == np.float32(0.1)
-    assert motion[CHANNEL_INDEX["mouthSmileRight"]] == np.float32(0.9)
-    assert motion[CHANNEL_INDEX["yaw"]] == -0.5
+    assert motion[CHANNEL_INDEX["mouthSmileRight"]] == np.float32(0.9) and motion[CHANNEL_INDEX["yaw"]] == -0.5
     held = held_face(parse_face(["jawOpen=0.8"]), hold_s=1.0)
     times = np.array([0.0, EASE_S, EASE_S + RISE_S, EASE_S + RISE_S + 1.0, held.duration_s])
     jaw = held.sample(times, 0.0, None)[0][:, CHANNEL_INDEX["jawOpen"]]

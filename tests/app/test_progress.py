@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from sfms_robot.app.progress import PLAIN_EVERY_S, PlainBar, bar, console, in_words, tracked
+from sfms_robot.app.progress import PLAIN_EVERY_S, PlainBar, bar, console, tracked
 
 
 @pytest.fixture
@@ -45,11 +45,6 @@ def test_lines_estimate_the_rest_from_the_checkpoint_or_say_how_long_it_took_so_
     assert capsys.readouterr().err == "composing dyads: reading, 30 s so far\n"
 
 
-@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (99, "99 s"), (720, "12 min"), (11_100, "3 h 5 min")])
-def test_lengths_of_time_in_words(seconds, text):
-    assert in_words(seconds) == text
-
-
 def test_short_work_is_silent_and_a_hidden_bar_shows_nothing(capsys):
     assert list(tracked([1, 2, 3], "counting")) == [1, 2, 3]
     assert capsys.readouterr() == ("", "")
@@ -65,16 +60,12 @@ def test_on_a_terminal_a_bar_shows_share_time_and_rest_on_stderr_alone(capsys):
         moved(1, 4, "graph told")
     out, text = capsys.readouterr()
     assert not out
-    assert "exporting [x] {y}" in text
-    assert "25 %" in text
-    assert "graph told" in text
-    assert "left" in text
+    assert "exporting [x] {y}" in text and "25 %" in text and "graph told" in text and "left" in text
 
 
 @pytest.mark.usefixtures("terminal")
 def test_bars_may_be_nested_and_log_lines_stand_above_them(capsys):
-    handler = logging.StreamHandler(sys.stderr)
-    root = logging.getLogger()
+    handler, root = logging.StreamHandler(sys.stderr), logging.getLogger()
     root.addHandler(handler)
     try:
         for name in tracked(["a"], "tables"):

@@ -22,8 +22,7 @@ def test_what_was_recorded_is_read_back(tmp_path):
     np.testing.assert_allclose(run.times_s, np.arange(200) / 100, atol=1e-9)
     np.testing.assert_allclose(run.goals_rad[:, 1], run.times_s / 10, atol=1e-5)
     np.testing.assert_allclose(run.present_rad[:, 0], run.goals_rad[:, 0], atol=1e-5)
-    assert np.isnan(run.present_rad[:, 1:]).all()
-    assert run.faults.any(axis=0).tolist() == [False, True, False]
+    assert np.isnan(run.present_rad[:, 1:]).all() and run.faults.any(axis=0).tolist() == [False, True, False]
     assert run.motion.shape == (200, 58) and len(run.audio) == 50 * 640
     assert np.isnan(run.speaker[1::2]).all() and (run.speaker[::2] == 0.25).all()
     assert run.states == [(0.0, "listening", ()), (1.5, "halted", ("key",))]
@@ -48,8 +47,7 @@ def test_the_heads_own_voice_and_jaws_are_read_back_beside_the_persons(tmp_path)
 def test_events_that_plans_held_are_read_back(tmp_path):
     recorder = Recorder(tmp_path, JOINTS, when_full="wait")
     recorder.tick(Tick(0.0, np.zeros(58, np.float32), np.zeros(3), {}))
-    times_s = np.arange(1, 51) * FRAME_S
-    frames = np.zeros((50, 58), np.float32)
+    times_s, frames = np.arange(1, 51) * FRAME_S, np.zeros((50, 58), np.float32)
     frames[20:23, [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]] = 1.0
     recorder.planned(Plan(0.0, times_s, frames))
     recorder.close()
@@ -61,8 +59,7 @@ def test_reading_holds_numbers_and_no_messages(tmp_path):
     """Nothing is kept on the way that is much larger than the arrays."""
     record(tmp_path, 20.0)
     tracemalloc.start()
-    run = read_recording(tmp_path)
-    peak = tracemalloc.get_traced_memory()[1]
+    run, peak = read_recording(tmp_path), tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     kept = sum(value.nbytes for value in vars(run).values() if isinstance(value, np.ndarray))
     assert peak < 6 * kept, f"{peak / 2000:.0f} bytes a tick"

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from free_ports import free_tcp_port, free_udp_port
 from pythonosc.osc_packet import OscPacket
 from websockets.sync.client import connect
 
@@ -60,7 +61,7 @@ class Readers:
         self.osc.bind(("127.0.0.1", 0))
         self.osc.settimeout(0.2)
         self.over = threading.Event()
-        self.port = free_port()
+        self.port = free_tcp_port()
         self.outputs = (f"json:{self.port}", f"vmc:{self.osc.getsockname()[1]}")
         self.threads = [threading.Thread(target=each, daemon=True) for each in (self.read_json, self.read_osc)]
 
@@ -95,11 +96,6 @@ class Readers:
                     self.faces.append(time.monotonic())
                 if timed.message.params[:1] == ["Head"]:
                     self.pitch.append(2 * timed.message.params[4])  # of half the turn, about Unity's x
-
-
-def free_port():
-    with socket.create_server(("127.0.0.1", 0)) as found:
-        return found.getsockname()[1]
 
 
 @pytest.mark.realtime
@@ -138,7 +134,7 @@ def test_readers_of_two_outputs_see_the_face_of_the_run_and_a_halt_makes_it_neut
 
 @pytest.mark.realtime
 def test_a_receiver_that_is_away_is_said_once_and_named_by_the_state(caplog):
-    report = run(replace(LIVE, duration_s=3.0, outputs=(f"vmc:{free_port()}",)))
+    report = run(replace(LIVE, duration_s=3.0, outputs=(f"vmc:{free_udp_port()}",)))
     (sent,) = report["outputs"]
     assert (report["exit"], sent["state"], sent["losses"]) == ("done", "lost", 1)
     assert [f"vmc:{sent['peer']}"] in [each["why"] for each in report["states"]["changes"]]

@@ -62,8 +62,7 @@ def test_a_run_that_ends_by_an_error_has_its_report_and_says_why(error, code, tm
                 raise error
             return []
 
-    options = RunOptions(head=HEAD, fast=True, record=tmp_path / "run")
-    report = run(options, source=Broken(), signals=False)
+    report = run(RunOptions(head=HEAD, fast=True, record=tmp_path / "run"), source=Broken(), signals=False)
     assert (report["exit"], report["error"], report["exit_code"]) == ("failed", str(error), code)
     assert report["ticks"] > 100 and report["limits"]["violations"] == 0
     assert json.loads((tmp_path / "run" / "report.json").read_text())["error"] == str(error)
@@ -115,8 +114,7 @@ def drive(how=0, fault=None, bus=lambda bus: bus):
 def test_torque_that_is_not_confirmed_off_overrides_success_and_interruption_and_no_error(how, code, fault):
     drove, torques = drive(how, fault)
     named = {None: [], "silent": ["pan", "tilt"], "silent:2": ["tilt"]}[fault]
-    assert drove.log.torque_unconfirmed == named
-    assert torques == [joint in named for joint in ("pan", "tilt")]
+    assert drove.log.torque_unconfirmed == named and torques == [joint in named for joint in ("pan", "tilt")]
     own = code in (0, 130)
     assert drove.exit_code == (4 if named and own else code)
     assert drove.log.states[-1][1].name == ("fault" if named or not own else "stopped")

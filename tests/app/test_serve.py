@@ -82,8 +82,7 @@ def heads(file, wanted):
 
 def obeyed(file, wanted, *words):
     """Ask until all have answered: a busy machine takes longer than a head is waited for."""
-    end_s = time.monotonic() + LIMIT_S
-    answers = {}
+    end_s, answers = time.monotonic() + LIMIT_S, {}
     while answers != wanted:
         assert time.monotonic() < end_s, answers
         answers = {each["name"]: each.get("done") for each in asked(file, *words).get("answers", [])}
@@ -114,8 +113,7 @@ def test_two_heads_and_one_server_each_in_a_process_of_its_own(zenoh_files):
             assert report["exit"] == "interrupted" and report["limits"]["violations"] == 0
             assert report["listener_state"]["link"]["round_trip_ms"]["p50"] is not None
         process.send_signal(signal.SIGTERM)
-        figures = json.loads(process.communicate(timeout=LIMIT_S)[0].splitlines()[-1])
-        assert figures["plans"] > 0
+        assert json.loads(process.communicate(timeout=LIMIT_S)[0].splitlines()[-1])["plans"] > 0
 
 
 @pytest.mark.slow

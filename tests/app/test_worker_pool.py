@@ -31,8 +31,7 @@ def joined(pool, client, seed=0):
 
 def voice(seed, frames):
     """16-bit sound, as it survives the way."""
-    rng = np.random.default_rng(seed)
-    whole = rng.integers(-3000, 3000, (frames, 640)).astype(np.float32) / 32768
+    whole = np.random.default_rng(seed).integers(-3000, 3000, (frames, 640)).astype(np.float32) / 32768
     return [SpeakerFrame((index + 1) * FRAME_S, samples) for index, samples in enumerate(whole)]
 
 
