@@ -90,9 +90,8 @@ def folder(tmp_path_factory):
 )
 def test_every_command_without_hardware_succeeds(line, folder):
     program = [sys.executable, "-P", "-c", "from sfms_robot.cli.main import main; main()"]
-    done = subprocess.run(
-        [*program, *shlex.split(line)[1:]], cwd=folder, capture_output=True, text=True, check=False, timeout=240
-    )  # fmt: skip
+    words = shlex.split(re.sub(r"--duration \d+", "--duration 3", line))[1:]  # as typed, but for less long
+    done = subprocess.run([*program, *words], cwd=folder, capture_output=True, text=True, check=False, timeout=240)
     assert done.returncode == 0, done.stderr
 
 

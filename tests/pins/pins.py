@@ -21,7 +21,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -56,12 +56,12 @@ COMMANDS = (
     "output list",
     "speaker list",
     "port list",
-    "servo scan --port sim",
+    "servo scan --port sim --ids 1-5",
     "servo ping 1 --port sim",
     "servo read 1 present_position --port sim",
     "servo write 1 led 1 --yes --port sim",
     "servo move 1 --by 10 --port sim",
-    "servo dump {tmp}/servos.yaml --port sim",
+    "servo dump {tmp}/servos.yaml --port sim --ids 1",
     "servo restore {tmp}/servos.yaml --yes --port sim",
     "servo set-id 1 99 --in-chain --yes --port sim",
     "servo set-baud 1 1000000 --yes --port sim",
@@ -121,12 +121,12 @@ def key_paths(value: Any, at: str = "") -> set[str]:
     return {f"{at}.{name}{path}" for name, paths in below.items() for path in paths}
 
 
-def keys() -> dict[str, list[str]]:
-    """Run every command of `COMMANDS`, and return the keys of each printed object. Takes minutes."""
+def keys(ask: Callable[[str], Any] = printed) -> dict[str, list[str]]:
+    """Run every command of `COMMANDS` by `ask`, and return the keys of each printed object. Takes minutes."""
     with tempfile.TemporaryDirectory() as tmp:
         folder = Path(tmp)
         write_inputs(folder)
-        told = {words: printed(words.format(tmp=folder)) for words in COMMANDS}
+        told = {words: ask(words.format(tmp=folder)) for words in COMMANDS}
     return {words: sorted(path.lstrip(".") for path in key_paths(each)) for words, each in told.items()}
 
 
