@@ -115,9 +115,7 @@ def test_commands_that_listen_and_move_stay_here(watched):
     agent = f"tcp:{free_tcp_port()}"
     watched.run("run", "--head", HEAD, "--duration", "2", "--record", "kept", "--status", "0", "--agent-audio", agent)
     watched.run("run", "--head", HEAD, "--duration", "2", "--view", "0")
-    watched.run(
-        "run", "--head", HEAD, "--fast", "--duration", "1", "--listener", "arig-small", "--agent-audio", "katie"
-    )
+    watched.run(*f"run --head {HEAD} --fast --duration 1 --listener arig-small --agent-audio katie".split())
     watched.run("demo", "--head", HEAD, "--fast", "--duration", "2", "--out", "shown")
     watched.run("replay", "kept", "--json")
     assert watched.strangers() == []

@@ -296,8 +296,7 @@ def test_a_process_that_cannot_be_started_counts_as_another_failure():
     watched = Watched(processes.LIMITS["source"])
     watched.refusals = 2
     watched.supervised.fail("gone")
-    assert watched.until(lambda child: child.phase == "starting") == 0.5 + 1.0 + 2.0
-    assert len(watched.children) == 2
+    assert watched.until(lambda child: child.phase == "starting") == 0.5 + 1.0 + 2.0 and len(watched.children) == 2
 
 
 @given(st.lists(st.integers(0, 30), max_size=60))

@@ -67,8 +67,7 @@ class Played(BaseOutputTransport):
 
 def test_sound_that_passes_reaches_the_robot_and_every_frame_passes():
     robot, voice, speech = NotedRobot(), pcm(InputAudioRawFrame, VOICE, 16000), pcm(TTSAudioRawFrame, SPEECH, 24000)
-    music = pcm(OutputAudioRawFrame, SPEECH, 24000)
-    stop = InterruptionFrame()
+    music, stop = pcm(OutputAudioRawFrame, SPEECH, 24000), InterruptionFrame()
     down, _ = run(ListeningHead(robot), [voice, speech, music, SleepFrame(0.05), stop])
     assert {id(frame) for frame in down} == {id(voice), id(speech), id(music), id(stop)}
     assert robot.heard == [(VOICE, 16000)] and robot.said == [(SPEECH, 24000)] and robot.hushed == 1

@@ -13,14 +13,12 @@ def listener():
 
 
 def test_a_stream_is_the_pure_step_with_its_memory_kept(listener):
-    rng = np.random.default_rng(0)
-    sound = rng.normal(0, 0.1, (12, 640)).astype(np.float32)
+    sound = np.random.default_rng(0).normal(0, 0.1, (12, 640)).astype(np.float32)
     stream, memory = listener.stream(seed=3), listener.start(3)
     plans = 0
     for index, samples in enumerate(sound):
         plan = stream.push(samples)
-        frame = sr.SpeakerFrame((index + 1) / 25, samples)
-        expected, memory = listener.step(frame, memory)
+        expected, memory = listener.step(sr.SpeakerFrame((index + 1) / 25, samples), memory)
         assert (plan is None) == (expected is None)
         if plan is not None and expected is not None:
             plans += 1
@@ -54,5 +52,4 @@ def test_what_is_no_frame_is_refused_and_the_stream_goes_on(listener, given, mes
     stream, untouched = listener.stream(), listener.stream()
     with pytest.raises(sr.InputError, match=message):
         stream.push(**given)
-    assert stream.time_s == 0.0
-    assert np.array_equal(stream.push(None).frames, untouched.push(None).frames)
+    assert stream.time_s == 0.0 and np.array_equal(stream.push(None).frames, untouched.push(None).frames)

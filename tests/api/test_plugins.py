@@ -143,5 +143,4 @@ def test_a_head_on_a_bus_of_another_package_runs_on_emulated_servos(installed, t
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout.splitlines()[-1])
     assert report["exit"] == "done" and report["limits"]["violations"] == 0
-    assert report["bus"]["whose"] == "somebody's"
-    assert report["joints"]["head_tilt"]["travel_rad"] > 0.1
+    assert report["bus"]["whose"] == "somebody's" and report["joints"]["head_tilt"]["travel_rad"] > 0.1

@@ -12,8 +12,7 @@ import sfms_robot
 
 @pytest.mark.parametrize("name", sfms_robot.__all__)
 def test_every_public_name_is_there(name):
-    assert getattr(sfms_robot, name) is not None
-    assert name in dir(sfms_robot)
+    assert getattr(sfms_robot, name) is not None and name in dir(sfms_robot)
 
 
 def test_type_checkers_see_the_same_names_and_an_unknown_one_is_an_attribute_error():

@@ -245,18 +245,13 @@ def test_a_robot_is_halted_and_goes_on_when_it_is_resumed():
         robot.wait(0.3)
         assert robot.state == "starting"
     assert [change["state"] for change in robot.report()["states"]["changes"]] == [
-        "starting",
-        "halted",
-        "starting",
-        "stopping",
-        "stopped",
-    ]
+        "starting", "halted", "starting", "stopping", "stopped",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("opens", [sr.Robot, sr.open_bus])
 def test_torque_that_is_not_confirmed_off_is_raised_by_the_end_and_in_the_report(opens, tmp_path):
-    servos = emulated(sr.load_head(HEAD))["main"]
-    device = str(tmp_path / "servos")
+    servos, device = emulated(sr.load_head(HEAD))["main"], str(tmp_path / "servos")
     with launch(servos, link=device) as chain:
         with (
             pytest.raises(sr.BusError, match="torque of .* could not be confirmed off"),

@@ -35,8 +35,7 @@ def test_sync_write_and_all_sync_reads(bench, again):
         assert again(lambda i=servo: sdk.write1ByteTxRx(port, i, 64, 1), lambda a: a == NO_ERROR)
     write, read = GroupSyncWrite(port, sdk, 116, 4), GroupSyncRead(port, sdk, 132, 4)
     for servo in IDS:
-        assert write.addParam(servo, list((2100 + servo).to_bytes(4, "little")))
-        assert read.addParam(servo)
+        assert write.addParam(servo, list((2100 + servo).to_bytes(4, "little"))) and read.addParam(servo)
     assert write.txPacket() == COMM_SUCCESS
 
     def positions():

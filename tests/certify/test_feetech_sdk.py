@@ -20,8 +20,7 @@ def test_sts_servos_are_synced(plugged_in, again):
     write, read = sdk.GroupSyncWrite(port, handler, 42, 2), sdk.GroupSyncRead(port, handler, 56, 4)
     for servo in IDS:
         again(lambda i=servo: handler.write1ByteTxRx(port, i, 40, 1), lambda a: a == (0, 0))
-        assert write.addParam(servo, [sdk.SCS_LOBYTE(2100), sdk.SCS_HIBYTE(2100)])
-        assert read.addParam(servo)
+        assert write.addParam(servo, [sdk.SCS_LOBYTE(2100), sdk.SCS_HIBYTE(2100)]) and read.addParam(servo)
     assert write.txPacket() == 0
     again(read.txRxPacket, lambda result: result == 0 and [read.getData(i, 56, 2) for i in IDS] == [2100, 2100])
     port.closePort()

@@ -101,8 +101,7 @@ def test_a_finished_training_is_kept_resumed_or_overwritten_as_asked(done, fails
     wider["listener"]["tokenizer_width"] = 16
     assert "listener.tokenizer_width = 8 there, 16 now" in fails("tokenizer", "--resume", raw=wider)
     weights = tmp_path / "out" / "tokenizer.safetensors"
-    kept = weights.read_bytes()
-    line = fails("tokenizer", "--steps", "3")
+    kept, line = weights.read_bytes(), fails("tokenizer", "--steps", "3")
     assert f"{weights} is of an earlier training: --resume continues it, --overwrite" in line
     assert weights.read_bytes() == kept
     weights.unlink()

@@ -53,8 +53,7 @@ def test_what_would_hurt_is_one_line(tmp_path, change, told):
 
 def changed(tmp_path, before, after):
     """A small head with other words in its file."""
-    name = written(tmp_path)
-    file = tmp_path / "head.yaml"
+    name, file = written(tmp_path), tmp_path / "head.yaml"
     file.write_text(file.read_text().replace(before, after))
     return name
 

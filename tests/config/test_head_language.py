@@ -189,8 +189,7 @@ WRONG = {
 
 @pytest.mark.parametrize("change, told", WRONG.values(), ids=WRONG.keys())
 def test_a_wrong_word_is_told_by_the_check_and_refused_by_the_loader(change, told, tmp_path):
-    file = written(tmp_path, added(change))
-    found = check_head(str(tmp_path))
+    file, found = written(tmp_path, added(change)), check_head(str(tmp_path))
     assert any(line.startswith(f"{file}: ") and told in line for line in found), found
     with pytest.raises(ConfigError) as caught:
         load(Head, file)
@@ -230,8 +229,7 @@ def test_the_check_lists_all_wrong_values_then_all_contradictions(tmp_path):
         "joints.beak: min_deg 0 is not below max_deg -5", "joints.lid_left.drive.channel = 'eyeBlnk'",
     )  # fmt: skip
     for head, told in ((wrong, values), (raw, contradictions)):
-        file = written(tmp_path, head)
-        found = check_head(str(tmp_path))
+        file, found = written(tmp_path, head), check_head(str(tmp_path))
         assert all(sum(each in line for line in found) == 1 for each in told), found
         assert len(found) == len(told) and all(line.startswith(f"{file}: ") for line in found)
 

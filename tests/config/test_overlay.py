@@ -54,8 +54,7 @@ def test_ends_and_rest_lie_where_they_were_measured(joint, sign):
     ticks = (1800, 1800 if at_end else 2010, 2400)
     low, rest, high = ticks if sign > 0 else [4095 - t for t in ticks]
     found = overlays.calibrated(config, measured(joint, low, rest, high, sign))
-    turn = load_firmware_map(config.model).ticks_per_revolution
-    conversion = Calibration({joint: found}, np.array([turn]))
+    conversion = Calibration({joint: found}, np.array([load_firmware_map(config.model).ticks_per_revolution]))
     angles = [[math.radians(found.min_deg)], [found.rest_rad], [found.max_rad]]
     assert [int(conversion.to_ticks(np.array(a))[0]) for a in angles] == pytest.approx([low, rest, high], abs=1)
     assert found.rest_deg == config.rest_deg and found.min_deg <= found.rest_deg <= found.max_deg
@@ -113,10 +112,8 @@ def test_show_tells_calibrated_and_fitted_values_from_those_of_the_file():
     overlays.save_overlay(overlay(jaw=measured(), fit=FIT), overlays.overlay_file("face28"))
     told, refused = overlays.provenance("face28")
     assert told["jaw"]["sign"] == (1, "calibrate 2026-05-17")
-    assert told["jaw"]["max_deg"][1] == "calibrate 2026-05-17"
-    assert told["jaw"]["id"][1] == "head file"
-    assert told[FITTED]["drive"][1] == "fit 2026-05-17"
-    assert told["lid_left"]["drive"][1] == "head file"
+    assert told["jaw"]["max_deg"][1] == "calibrate 2026-05-17" and told["jaw"]["id"][1] == "head file"
+    assert told[FITTED]["drive"][1] == "fit 2026-05-17" and told["lid_left"]["drive"][1] == "head file"
     assert refused == []
 
 
@@ -183,8 +180,7 @@ def test_a_stored_value_goes_into_the_user_s_own_file_and_all_else_in_it_stays(t
     assert after == before.replace("{stored: {drive_mode: 1}}", "{stored: {homing_offset: -100, drive_mode: 0}}")
     head = load_head(name)
     assert head.safety_of("tilt").stored == {"drive_mode": 0, "homing_offset": -100}
-    assert head.safety_of("pan").stored == {"drive_mode": 0}
-    assert not overlays.overlay_file(head.name).exists()
+    assert head.safety_of("pan").stored == {"drive_mode": 0} and not overlays.overlay_file(head.name).exists()
 
 
 SHARED = {
@@ -199,8 +195,7 @@ SHARED = {
 @pytest.mark.parametrize("form", SHARED)
 def test_a_file_in_which_one_joint_cannot_change_alone_gets_an_overlay(tmp_path, form):
     name = copied(tmp_path / "turret", *SHARED[form])
-    before = (tmp_path / "turret" / "head.yaml").read_text()
-    head = load_head(name)
+    before, head = (tmp_path / "turret" / "head.yaml").read_text(), load_head(name)
     assert overlays.record_stored(name, "pan", {"drive_mode": 4}) == overlays.overlay_file(head.name)
     assert (tmp_path / "turret" / "head.yaml").read_text() == before
     now = overlays.layered(head, overlays.load_overlay(head), overlays.head_hash(name)).head
@@ -222,8 +217,7 @@ def test_a_shipped_head_and_one_that_was_calibrated_are_not_edited(tmp_path):
 
 def test_what_was_measured_keeps_what_the_head_declares_for_all_joints():
     usual = FACE.safety.model_copy(update={"stored": {"operating_mode": 3}})
-    head = FACE.model_copy(update={"safety": usual})
-    now = overlays.layered(head, overlay(jaw=measured()), SHA).head
+    now = overlays.layered(FACE.model_copy(update={"safety": usual}), overlay(jaw=measured()), SHA).head
     assert now.safety_of("jaw").stored == {"operating_mode": 3, "homing_offset": 0, "drive_mode": 0}
 
 
@@ -234,8 +228,7 @@ def test_a_value_comes_from_its_own_line_its_twin_the_defaults_or_nowhere():
     assert told["eye_pan_right"]["model"] == ("xl330-m288", "joint_defaults")
     assert told["eye_pan_right"]["ratio"] == (1.0, "built in")
     assert told["lid_right"]["sign"] == (-1, "mirror of lid_left")
-    assert told["lid_right"]["drive"][1] == "mirror of lid_left"
-    assert told["lid_left"]["drive"][1] == "head file"
+    assert told["lid_right"]["drive"][1] == "mirror of lid_left" and told["lid_left"]["drive"][1] == "head file"
 
 
 def test_every_joint_and_key_is_there():

@@ -34,8 +34,7 @@ def of_sockets(read, write, other, timeout=None):
 def socket_pair():
     """Return two sockets that are connected by loopback."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        near = socket.create_connection(server.getsockname())
-        return near, server.accept()[0]
+        return socket.create_connection(server.getsockname()), server.accept()[0]
 
 
 def hide_proc(event, arguments):

@@ -31,8 +31,7 @@ def test_the_head_looks_along_x_and_signs_of_the_pose_are_ours():
     assert np.ptp(REST, axis=0).argmax() == 2
     nose = REST[:, 0].argmax()
     ear = REST[:, 1].argmin()  # the right one
-    assert moved(BALD, pitch=0.2)[nose, 2] < -0.01
-    assert moved(BALD, yaw=0.2)[nose, 1] > 0.01
+    assert moved(BALD, pitch=0.2)[nose, 2] < -0.01 and moved(BALD, yaw=0.2)[nose, 1] > 0.01
     assert moved(BALD, roll=0.2)[ear, 2] < -0.01
     np.testing.assert_allclose(moved(BALD, z=0.01)[nose], [0, 0, 0.01], atol=1e-6)
 
@@ -60,8 +59,7 @@ def test_the_file_holds_parts_that_hang_together():
     triangles = ARRAYS["triangles"].reshape(-1, 3)
     assert triangles.max() < FACTS["vertices"] == len(PART)
     assert [morph["name"] for morph in FACTS["morphs"]] == list(BLENDSHAPES)
-    assert (PART[triangles] == PART[triangles][:, :1]).all()
-    assert set(np.unique(PART)) == set(range(len(PARTS)))
+    assert (PART[triangles] == PART[triangles][:, :1]).all() and set(np.unique(PART)) == set(range(len(PARTS)))
     assert np.isfinite(HEAD.rest).all() and HEAD.triangles.max() == len(HEAD.rest) - 1
     assert len(HEAD.rest) == len(HEAD.colors) == len(HEAD.share)
 

@@ -97,8 +97,7 @@ def test_what_is_drawn_is_of_what_is_read_whatever_was_before():
     scene = scene_of(load_head("reachy_mini"))
     rest = scene.rest()
     hangs = scene.values(np.array([-0.84, 0.19, -0.86, 0.19, -0.86, 0.07, -0.86, -0.38, -0.04]))  # sunk, each by itself
-    assert np.abs(hangs - rest).max() > 1.0
-    assert scene.rest() == pytest.approx(rest, abs=1e-9)
+    assert np.abs(hangs - rest).max() > 1.0 and scene.rest() == pytest.approx(rest, abs=1e-9)
 
 
 def test_an_angle_that_was_never_read_stays_at_rest():

@@ -66,8 +66,7 @@ def test_a_broken_file_is_one_line_that_names_what_is_wrong(tmp_path, old, new, 
     file = written(tmp_path, TWO.replace(old, new))
     with pytest.raises(ConfigError) as caught:
         read_urdf(file)
-    assert str(caught.value).startswith(f"{file}: ") and told in str(caught.value)
-    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"{file}: ") and told in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_file_that_is_not_there_is_told(tmp_path):
@@ -104,8 +103,7 @@ def test_one_odd_part_of_the_picture_is_left_out_and_named(tmp_path, old, new, t
 def test_angles_beyond_a_turn_are_named_once_for_a_file(tmp_path):
     text = TWO.replace('<origin xyz="1 0 0"/>', '<origin rpy="0 0 90"/>').replace('rpy="0 0 0"', 'rpy="180 0 0"')
     assert ["in 2 elements (degrees?)" in line for line in read_urdf(written(tmp_path, text)).left_out] == [True]
-    turned = TWO.replace('rpy="0 0 0"', f'rpy="0 0 {np.pi}"')
-    assert not read_urdf(written(tmp_path, turned)).left_out
+    assert not read_urdf(written(tmp_path, TWO.replace('rpy="0 0 0"', f'rpy="0 0 {np.pi}"'))).left_out
 
 
 FLOATING = '<joint name="a" type="floating"><parent link="sky"/><child link="base"/></joint>'

@@ -53,8 +53,7 @@ def test_a_mirrored_face_gives_mirrored_joints(seed):
 def test_every_region_can_be_turned_to_rest():
     motion = np.ones(MOTION_DIM, np.float32)
     still = MAPPING.mapping.knobs(intensity=dict.fromkeys(HEAD.regions, 0.0))
-    moved = np.array(JOINTS)[MAPPING.angles(motion, still) != REST]
-    assert moved.size == 0
+    assert np.array(JOINTS)[MAPPING.angles(motion, still) != REST].size == 0
 
 
 def test_every_joint_but_the_sideways_tongue_is_driven_to_a_good_part_of_its_range():
@@ -70,8 +69,7 @@ def test_every_joint_but_the_sideways_tongue_is_driven_to_a_good_part_of_its_ran
 
 @pytest.mark.parametrize("joint", ["lid_left", "lid_right"])
 def test_a_lid_closes_with_a_blink_whatever_else_the_eye_does(joint):
-    side = joint.removeprefix("lid_").capitalize()
-    top = HEAD.joints[joint].max_deg
+    side, top = joint.removeprefix("lid_").capitalize(), HEAD.joints[joint].max_deg
     for other in ({}, {f"eyeLookUp{side}": 1.0}, {f"eyeWide{side}": 1.0}):
         assert angle_deg(joint, **{f"eyeBlink{side}": 0.86}, **other) == pytest.approx(top)
 
@@ -93,8 +91,7 @@ def test_the_upper_lid_adds_up_blink_squint_gaze_and_widening(channels, closure)
 
 
 def test_the_lips_never_cross_whatever_the_mouth_does():
-    rng = np.random.default_rng(1)
-    motion = np.zeros((2000, MOTION_DIM), np.float32)
+    rng, motion = np.random.default_rng(1), np.zeros((2000, MOTION_DIM), np.float32)
     motion[:, 6:] = rng.choice([0.0, 0.3, 1.0], (2000, MOTION_DIM - 6))
     angles = np.array([MAPPING.angles(row) for row in motion])
     units = angles / np.where(angles > 0, HIGH, -LOW)

@@ -26,12 +26,10 @@ def test_a_known_response_is_found_under_noise():
 
 def test_what_the_tracker_sees_at_rest_is_no_response_and_the_curve_undoes_the_response():
     (response,) = fit(HAS, curved(HAS) + 0.1, -ONE, ONE)
-    assert response.offset == pytest.approx(0.1, abs=0.01)
-    assert response(np.zeros(1))[0] == 0.0
+    assert response.offset == pytest.approx(0.1, abs=0.01) and response(np.zeros(1))[0] == 0.0
     (response,) = fit(HAS, curved(HAS), -ONE, ONE)
     x, y = np.array(response.curve).T
-    assert (np.diff(x) > 0).all()
-    assert np.abs(response(y) - x).max() < 1e-4
+    assert (np.diff(x) > 0).all() and np.abs(response(y) - x).max() < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -45,8 +43,7 @@ def test_whatever_was_seen_the_response_rises_within_its_bounds(looks):
 
 
 def test_a_joint_that_hardly_moved_is_left_alone_and_frames_without_a_face_do_not_count():
-    assert fit(0.05 * HAS, HAS, -ONE, ONE) == [None]
-    assert fit(HAS[:20], HAS[:20], -ONE, ONE) == [None]
+    assert fit(0.05 * HAS, HAS, -ONE, ONE) == [None] and fit(HAS[:20], HAS[:20], -ONE, ONE) == [None]
     looks = curved(HAS)
     looks[::3] = np.nan
     (response,) = fit(HAS, looks, -ONE, ONE)
@@ -61,8 +58,7 @@ def test_units_go_there_and_back():
 
 def test_twins_answer_each_for_themselves_and_rest_stays_rest():
     head = load_head("face28")
-    units = Units.of(head)
-    names = list(head.joints)
+    units, names = Units.of(head), list(head.joints)
     has = np.clip(RNG.uniform(-1, 1, (2000, len(names))), units.low, units.high)
     looks = has.copy()
     left, right = names.index("corner_left"), names.index("corner_right")
@@ -75,6 +71,5 @@ def test_twins_answer_each_for_themselves_and_rest_stays_rest():
     faces[1, BLENDSHAPES.index("mouthSmileLeft")] = faces[1, BLENDSHAPES.index("mouthSmileRight")] = 0.4
     rest, smile = asked(fitted, faces)
     assert not rest.any()
-    assert smile[left] == pytest.approx(0.4, abs=0.01)
-    assert curved(smile[right]) == pytest.approx(0.4, abs=0.02)
+    assert smile[left] == pytest.approx(0.4, abs=0.01) and curved(smile[right]) == pytest.approx(0.4, abs=0.02)
     assert drives(head)["corner_right"] != drives(fitted)["corner_right"]

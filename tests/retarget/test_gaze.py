@@ -34,8 +34,7 @@ def test_channels_and_directions_are_inverse(yaw_left, pitch_left, yaw_right, pi
     wanted = np.radians([[yaw_left, pitch_left], [yaw_right, pitch_right]])
     motion = np.zeros(MOTION_DIM, np.float32)
     turn(motion, wanted, FULL_RAD)
-    assert directions(motion, FULL_RAD) == pytest.approx(wanted, abs=1e-6)
-    assert motion.min() >= 0
+    assert directions(motion, FULL_RAD) == pytest.approx(wanted, abs=1e-6) and motion.min() >= 0
 
 
 @pytest.mark.parametrize("size_deg", [0.0, 2.0, 10.0, 40.0])
@@ -47,8 +46,7 @@ def test_a_jump_takes_as_long_as_a_human_saccade_and_stays_where_it_lands(size_d
 
 
 def test_eyes_jump_to_a_new_target_and_noise_inside_the_dead_zone_moves_none():
-    rng = np.random.default_rng(0)
-    noise = rng.uniform(-0.4, 0.4, (400, 2))
+    noise = np.random.default_rng(0).uniform(-0.4, 0.4, (400, 2))
     shown = looked(lambda t: looking(5.0 + noise[int(t / TICK_S), 0], noise[int(t / TICK_S), 1]), 3.0)
     assert np.ptp(eyes_deg(shown), axis=(0, 1)).max() < 1e-4
     shown = eyes_deg(looked(lambda t: looking(0.0 if t < 0.5 else 12.0), 1.0))[:, 0, 0]
@@ -84,8 +82,7 @@ def test_eyes_turned_too_far_by_a_turning_head_jump_back_to_its_front():
 
 
 def test_no_joint_jumps_whatever_its_lead():
-    rng = np.random.default_rng(3)
-    targets = rng.uniform(-20, 20, (20, 2)) * [1, 0.5]
+    targets = np.random.default_rng(3).uniform(-20, 20, (20, 2)) * [1, 0.5]
     shown = eyes_deg(looked(lambda t: looking(*targets[int(t / 0.3)], yaw=0.3 * math.sin(3 * t)), 5.0))
     speed = np.abs(np.diff(shown, axis=0)) / TICK_S
     assert speed.max() < 1000  # a 40-degree saccade peaks at about 640 deg/s
@@ -127,10 +124,8 @@ def test_there_and_back(mount, place_m, pose):
 
 def test_a_camera_sees_a_person_from_a_turned_head_or_from_above_in_the_bases_axes():
     mount = CameraMount(on="head")
-    camera = Camera(mount)
-    turned = np.array([0, 0, np.radians(30), 0, 0, 0])
-    seen = from_base(mount, (2.0, 0.0, 0.0), turned)
-    assert np.degrees(direction_to(seen)) == pytest.approx([-30, 0])
+    camera, turned = Camera(mount), np.array([0, 0, np.radians(30), 0, 0, 0])
+    assert np.degrees(direction_to(from_base(mount, (2.0, 0.0, 0.0), turned))) == pytest.approx([-30, 0])
     assert np.degrees(direction_to(camera.to_base((2.0, 0.0, 0.0), turned))) == pytest.approx([30, 0])
     camera = Camera(CameraMount(on="base", at_m=(0, 0, 0.3), rpy_deg=(0, 20, 0)))
     assert camera.to_base((1.0, 0.0, 0.0), np.zeros(6)) == pytest.approx([0.9397, 0, 0.3 - 0.342], abs=1e-3)

@@ -52,8 +52,7 @@ def test_eyes_go_to_the_person_first_and_the_head_follows():
 
 @pytest.mark.slow
 def test_noise_of_a_tracker_moves_nothing():
-    rng = np.random.default_rng(0)
-    noise_m = rng.normal(0, 0.02, (3000, 3))
+    noise_m = np.random.default_rng(0).normal(0, 0.02, (3000, 3))
     shown = aimed(at(lambda t: beside(20) + noise_m[round(t / FRAME_S)]), 90.0)[300:]
     assert np.ptp(gaze_deg(shown), axis=(0, 1)).max() < 1e-3
     assert np.ptp(head_deg(shown[200:]), axis=(0, 1)).max() < 1e-3
@@ -78,8 +77,7 @@ def test_who_walks_is_followed():
 
 
 def test_no_joint_jumps_whatever_its_lead():
-    rng = np.random.default_rng(2)
-    yaws = rng.uniform(-40, 40, 40)
+    yaws = np.random.default_rng(2).uniform(-40, 40, 40)
     shown = aimed(at(lambda t: beside(yaws[int(t / 0.7)])), 20.0, person=Person(look_away=2))
     assert np.abs(np.diff(gaze_deg(shown), axis=0)).max() / TICK_S < 1000  # a saccade of 80 degrees
     head = head_deg(shown)
@@ -100,8 +98,7 @@ def test_the_head_goes_back_slowly_when_the_person_has_gone_looks_around_and_fin
 
 def test_nobody_left_is_looked_for():
     shown = aimed(lambda t, shown: Watched(seen_s=min(t, 1.0)), 60.0, person=Person())[:, 0]
-    assert np.ptp(gaze_deg(shown[:300])[:, 0]) < 1
-    assert np.ptp(head_deg(shown[400:])[:, 0]) > 10
+    assert np.ptp(gaze_deg(shown[:300])[:, 0]) < 1 and np.ptp(head_deg(shown[400:])[:, 0]) > 10
 
 
 def test_without_a_face_a_camera_or_the_section_nothing_is_aimed_at():
@@ -168,8 +165,7 @@ def looks(gaze: np.ndarray) -> tuple[float, float, float]:
     """Share within 5 degrees of straight ahead, shifts of 5 degrees or more a minute, mean seconds away."""
     away = np.hypot(*gaze.T) > 5
     moved = np.hypot(*(gaze[10:] - gaze[:-10]).T) >= 5
-    minutes = len(gaze) * TICK_S / 60
-    out = np.count_nonzero(away[1:] & ~away[:-1])
+    minutes, out = len(gaze) * TICK_S / 60, np.count_nonzero(away[1:] & ~away[:-1])
     return 1 - away.mean(), np.count_nonzero(moved[1:] & ~moved[:-1]) / minutes, away.mean() * 60 * minutes / out
 
 

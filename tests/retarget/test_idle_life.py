@@ -72,8 +72,7 @@ def test_a_listener_that_never_blinks_gets_the_wanted_rate_until_it_begins_to_bl
 def test_a_blink_closes_in_the_time_it_takes_people_and_never_jumps():
     shown = idled(still, 60.0, head_deg=0, glance_deg=0)[..., BLINK]
     assert shown.max() == 1.0 and np.abs(np.diff(shown, axis=0)).max() < 1.9 * TICK_S / CLOSING_S
-    first = np.argmax(shown[:, 0] > 0)
-    length = np.argmax(shown[first:, 0] == 0) * TICK_S
+    length = np.argmax(shown[np.argmax(shown[:, 0] > 0) :, 0] == 0) * TICK_S
     assert length == pytest.approx(CLOSING_S + CLOSED_S + OPENING_S, abs=2 * TICK_S)
 
 

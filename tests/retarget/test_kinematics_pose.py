@@ -68,8 +68,7 @@ def test_no_other_turn_about_the_axis_leaves_less_than_the_twist(seed, axis, off
 @given(seeds, turns)
 def test_a_pose_seen_from_a_turned_body_is_the_same_transform_in_its_frame(seed, body):
     world = np.random.default_rng(seed).uniform(-1, 1, (20, 6))
-    seen = rotations.seen_from(body, world)
-    back = rotations.about(2, body)
+    seen, back = rotations.seen_from(body, world), rotations.about(2, body)
     assert back @ rotations.rotation(seen[:, :3]) == pytest.approx(rotations.rotation(world[:, :3]), abs=1e-12)
     assert seen[:, 3:] @ back.T == pytest.approx(world[:, 3:], abs=1e-12)
     assert rotations.seen_from(-body, seen) == pytest.approx(world, abs=1e-9)

@@ -135,8 +135,7 @@ def test_a_differential_at_its_end_keeps_the_direction_of_the_lean():
 
 @given(seeds)
 def test_joints_stay_inside_their_ranges_whatever_is_asked(seed):
-    rng = np.random.default_rng(seed)
-    wanted = rng.uniform(-3, 3, (100, 6))
+    wanted = np.random.default_rng(seed).uniform(-3, 3, (100, 6))
     for some in (
         neck(("yaw", "pitch", "roll"), reach=0.4),
         neck(("pitch", "yaw"), {"pitch": HALF, "yaw": "pan"}, reach=0.4),

@@ -26,8 +26,7 @@ def base_face(seed=0):
 
 def play(puppet, ticks, face, asked=(), leads_s=LEADS_S):
     """(ticks, leads, 58) of a listener that holds `face`; `asked`: tick -> what is asked before it."""
-    asked = dict(asked)
-    out = []
+    asked, out = dict(asked), []
     for tick in range(ticks):
         if tick in asked:
             asked[tick](puppet)
@@ -53,8 +52,7 @@ def test_a_whole_face_is_reached_held_and_left_again():
     assert np.array_equal(rows[:11], np.tile(face, (11, 1)))
     risen, falls = 10 + round(RISE_S / DT_S), 10 + round((RISE_S + 0.5) / DT_S)
     assert np.allclose(rows[risen : falls + 1], wanted, atol=1e-6)
-    assert np.array_equal(rows[falls + round(FALL_S / DT_S) + 1], face)
-    assert np.array_equal(rows[-1], face)
+    assert np.array_equal(rows[falls + round(FALL_S / DT_S) + 1], face) and np.array_equal(rows[-1], face)
 
 
 def test_channels_that_are_not_named_stay_the_listeners_and_a_stream_of_faces_takes_no_room():
@@ -117,8 +115,7 @@ def test_eyes_go_first_the_head_follows_and_the_gaze_stays_on_the_point():
         Puppet(), 150, np.zeros(MOTION_DIM, np.float32), {0: lambda p: p.look_at(1.0, 0.3, 0.1, 1.0)}, np.zeros(1)
     )
     motion = rows[:, 0]
-    eyes = directions(motion, FULL_RAD).mean(axis=1)
-    head = motion[:, [YAW, PITCH]]
+    eyes, head = directions(motion, FULL_RAD).mean(axis=1), motion[:, [YAW, PITCH]]
     wanted = np.array([math.atan2(0.3, 1.0), -math.atan2(0.1, math.hypot(1.0, 0.3))])
     early, late = round(EYES_S / DT_S) + 1, round(HEAD_S / DT_S) + 5
     assert np.allclose((eyes + head)[early:late], wanted, atol=1e-3)
@@ -133,8 +130,7 @@ def test_a_head_without_eyes_turns_all_the_way_and_one_without_a_neck_its_eyes()
     blind_eyes = frozenset(name for name in CHANNEL_INDEX if name.startswith("eyeLook"))
     eyeless = play(Puppet(blind=blind_eyes), 120, still, point, np.zeros(1))[100, 0]
     stiff = play(Puppet(blind=frozenset({"yaw", "pitch"})), 120, still, point, np.zeros(1))[100, 0]
-    assert eyeless[YAW] == pytest.approx(math.atan2(0.2, 1.0), abs=1e-4)
-    assert stiff[YAW] == 0.0
+    assert eyeless[YAW] == pytest.approx(math.atan2(0.2, 1.0), abs=1e-4) and stiff[YAW] == 0.0
     assert directions(stiff, FULL_RAD).mean(axis=0)[0] == pytest.approx(math.atan2(0.2, 1.0), abs=1e-4)
 
 

@@ -149,8 +149,7 @@ def test_no_mix_loses_the_voice_in_a_file_or_live(tmp_path, caplog, channels, mo
 def test_a_wav_file_that_was_streamed_is_whole(tmp_path, caplog, size, extra):
     soundfile.write(tmp_path / "a.wav", tone(16000), 16000)
     data = (tmp_path / "a.wav").read_bytes()
-    at = data.index(b"data")
-    sizes = struct.pack("<I", size)
+    at, sizes = data.index(b"data"), struct.pack("<I", size)
     (tmp_path / "b.wav").write_bytes(data[:4] + sizes + data[8:at] + extra + b"data" + sizes + data[at + 8 :])
     np.testing.assert_array_equal(read_audio(tmp_path / "b.wav"), read_audio(tmp_path / "a.wav"))
     assert not caplog.records

@@ -8,13 +8,9 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_S, ListenerEvent
 from sfms_robot.signals.control import BOUND, COLUMNS, KINDS, SWINGING, control_track
 
 EVENT = st.builds(
-    ListenerEvent,
-    kind=st.sampled_from(EVENT_KINDS),
-    start_s=st.floats(-2, 6),
-    duration_s=st.floats(1e-3, 5),
-    size=st.floats(-50, 50),
-    swings=st.integers(1, 9),
-)
+    ListenerEvent, kind=st.sampled_from(EVENT_KINDS), start_s=st.floats(-2, 6), duration_s=st.floats(1e-3, 5),
+    size=st.floats(-50, 50), swings=st.integers(1, 9),
+)  # fmt: skip
 EVENTS = st.lists(EVENT, max_size=6)
 
 
@@ -48,8 +44,7 @@ def test_kinds_do_not_meet_and_a_gaze_shift_is_not_told():
     nod, smile = ListenerEvent("nod", 0.2, 1.0, 0.1, swings=2), ListenerEvent("smile", 0.5, 2.0, 0.6)
     both = control_track([nod, smile], 0, 80)
     np.testing.assert_array_equal(both, control_track([nod], 0, 80) + control_track([smile], 0, 80))
-    shift = ListenerEvent("gaze_shift", 0.0, 1.0, 0.3, target_rad=(0.2, 0.0))
-    assert not control_track([shift], 0, 40).any()
+    assert not control_track([ListenerEvent("gaze_shift", 0.0, 1.0, 0.3, target_rad=(0.2, 0.0))], 0, 40).any()
 
 
 def test_a_swing_is_where_the_head_is_in_it_and_of_two_events_of_a_kind_the_later_is_told():

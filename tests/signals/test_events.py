@@ -40,8 +40,7 @@ def test_a_blink_is_counted_against_lids_that_rest_half_closed_and_a_long_closur
 
 
 def test_a_smile_lasts_and_ends_where_it_has_fallen_by_half_and_runs_are_half_open(time_s):
-    smile = np.clip(1.2 - np.abs(time_s - 4), 0, 1)
-    ((start_s, end_s, peak),) = find_smiles(smile, rate_of(time_s))
+    ((start_s, end_s, peak),) = find_smiles(np.clip(1.2 - np.abs(time_s - 4), 0, 1), rate_of(time_s))
     assert (start_s, end_s, peak) == (pytest.approx(2.9, abs=0.05), pytest.approx(5.1, abs=0.05), 1.0)
     assert not find_smiles(np.where(np.abs(time_s - 4) < 0.15, 0.9, 0.15), rate_of(time_s))
     assert runs([1, 1, 0, 1]) == [(0, 2), (3, 4)] and runs([]) == []
@@ -75,6 +74,4 @@ def test_the_highest_of_peaks_that_are_too_close_stays(seed):
 def test_the_band_pass_is_scipys_forwards_and_backwards(rate_hz, seconds):
     values = np.random.default_rng(1).normal(0, 0.01, int(rate_hz * seconds)).cumsum() + 0.4
     sections = signal.butter(2, (0.8, 6.0), "bandpass", fs=rate_hz, output="sos")
-    np.testing.assert_allclose(
-        band_pass(values, 0.8, 6.0, rate_hz), signal.sosfiltfilt(sections, values), atol=1e-12, rtol=0
-    )
+    assert band_pass(values, 0.8, 6.0, rate_hz) == pytest.approx(signal.sosfiltfilt(sections, values), abs=1e-12, rel=0)

@@ -37,8 +37,7 @@ def shift(first, second, before=25, after=50):
 
 
 def nod(frames, size_rad, length_s=0.5, at=30):
-    pose = np.zeros((frames, 6))
-    long = round(length_s * FRAME_HZ)
+    pose, long = np.zeros((frames, 6)), round(length_s * FRAME_HZ)
     pose[at : at + long, 1] = size_rad * (0.5 - 0.5 * np.cos(2 * np.pi * np.arange(long) / long))
     return pose
 
@@ -55,8 +54,7 @@ def test_a_whole_is_its_frames_one_by_one_and_mirrored_targets_give_mirrored_mot
         np.testing.assert_array_equal(one_eyes[0], eyes[row])
         assert state == states[row]
     targets = np.repeat(places, 12, axis=0)
-    poses = np.zeros((len(targets), 6))
-    state = gaze.start(seed, wanders=False)
+    poses, state = np.zeros((len(targets), 6)), gaze.start(seed, wanders=False)
     one, _ = played(targets, poses, state)
     two, _ = played(targets * [-1, 1], poses, state)
     np.testing.assert_allclose(two[:, :3], one[:, :3] * [-1, 1, -1], atol=1e-6)
@@ -70,8 +68,7 @@ def test_gaze_is_there_after_a_fifth_of_a_second(first, second, seed):
     targets = shift(first, second)
     motion, _ = played(targets, np.zeros((75, 6)), gaze.start(seed))
     off = np.hypot(*(gaze_of(motion) - targets).T)
-    assert np.degrees(off[25 + 4 :]).max() < 3
-    assert np.degrees(off[15:25]).max() < 3
+    assert np.degrees(off[25 + 4 :]).max() < 3 and np.degrees(off[15:25]).max() < 3
 
 
 @given(SEEDS, TARGETS.map(lambda target: 0.4 * target))
@@ -99,8 +96,7 @@ def test_the_eyes_leave_first_and_the_head_follows_more_for_a_larger_shift(seed)
     shares = [
         gaze.head_share((math.radians(size), 0.0), state.share)[0] / math.radians(size) for size in (4, 8, 16, 28)
     ]
-    assert shares == sorted(shares)
-    assert shares[0] < 0.16 and shares[1] < 0.3 and shares[-1] > 0.3
+    assert shares == sorted(shares) and shares[0] < 0.16 and shares[1] < 0.3 and shares[-1] > 0.3
 
 
 @given(st.lists(TARGETS, min_size=2, max_size=8), SEEDS, st.integers(2, 20))
@@ -115,8 +111,7 @@ def test_the_head_never_jumps_and_neither_does_its_speed(places, seed, held):
 def test_a_still_target_keeps_the_head_where_it_is_and_a_slow_one_is_followed_without_a_shift():
     targets = shift(np.zeros(2), np.radians([20.0, 6.0]), 5, 200)
     head, _, _ = gaze.follow(targets, np.zeros((205, 6)), gaze.start(3))
-    assert np.ptp(head[40:], axis=0).max() == 0
-    assert head[40, 2] > 0 and head[40, 1] > 0
+    assert np.ptp(head[40:], axis=0).max() == 0 and head[40, 2] > 0 and head[40, 1] > 0
     targets = np.radians(np.stack([np.linspace(0, 15, 200), np.zeros(200)], axis=1))
     motion, _ = played(targets, np.zeros((200, 6)), gaze.start(1, wanders=False))
     assert np.degrees(np.abs(gaze_of(motion) - targets)[1:]).max() < 0.2
@@ -143,8 +138,7 @@ def test_a_path_rests_at_both_ends_and_before_and_after_it_and_is_its_own_mirror
     u = np.linspace(0.0, 1.0, 201)
     assert (ease(-0.1), ease(1.1)) == (0.0, 1.0) and np.array_equal(ease(u), minimum_jerk(u))
     way = minimum_jerk(u)
-    assert (way[0], way[-1]) == (0.0, 1.0)
-    assert np.all(np.diff(way) > 0)
+    assert (way[0], way[-1]) == (0.0, 1.0) and np.all(np.diff(way) > 0)
     assert way + way[::-1] == pytest.approx(np.ones(201), abs=1e-12)
     for ends in (way[:2], 1 - way[-2:]):
         assert np.ptp(ends) < 10.1 * 0.005**3  # third order: neither speed nor acceleration

@@ -1,6 +1,5 @@
 """What a microphone hears of a person, of the head's own loudspeaker and of its motors, and what of it is told."""
 
-import os
 import subprocess
 import sys
 
@@ -81,11 +80,9 @@ def test_frames_do_not_depend_on_how_the_stream_was_cut(sizes):
 def test_echo_that_was_played_or_is_expected_is_taken_away():
     said = own_speech(8.0)
     heard = echo_of(said) + noise(len(said), -75)
-    after = EchoCanceller().push(heard, said).audio
-    loud = slice(4 * 16000, 8 * 16000)
+    after, loud = EchoCanceller().push(heard, said).audio, slice(4 * 16000, 8 * 16000)
     assert energy_db(after[loud]) < energy_db(heard[loud]) - 25
-    hum = noise(640, -30)
-    power = np.full((4, 161), 160 * 10 ** (-30 / 10))
+    hum, power = noise(640, -30), np.full((4, 161), 160 * 10 ** (-30 / 10))
     assert energy_db(MotorNoise().suppress(hum, 0.0, power)) < energy_db(MotorNoise().suppress(hum, 0.0)) - 6
 
 
@@ -120,8 +117,7 @@ def test_the_person_is_heard():
 
 
 def test_learned_motor_noise_is_taken_away_and_at_another_speed_nothing_is():
-    motors = MotorNoise()
-    hum = noise(640 * 100, -30).reshape(-1, 640)
+    motors, hum = MotorNoise(), noise(640 * 100, -30).reshape(-1, 640)
     for frame in hum[:90]:
         motors.suppress(frame, [0.5, -0.5])
         motors.learn()
@@ -165,8 +161,7 @@ def test_what_is_not_finite_is_heard_as_silence_and_forgotten(value):
 def test_a_network_begins_anew_after_noise_and_then_nobody_and_never_otherwise():
     hum, voice = noise(FORGETS_WINDOWS * WINDOW, -40), talk("caller", 10.0, 2.0)
     used, fresh = SpeechProbability(), SpeechProbability()
-    assert max(used.push(hum, noise=True)) < 0.1
-    assert used.push(voice) == fresh.push(voice)
+    assert max(used.push(hum, noise=True)) < 0.1 and used.push(voice) == fresh.push(voice)
     quiet, voice = np.zeros(3 * FORGETS_WINDOWS * WINDOW, np.float32), talk("caller", 10.0, 2.0)
     used, fresh = SpeechProbability(), SpeechProbability()
     used.push(quiet)
@@ -191,7 +186,5 @@ def test_neither_torch_nor_the_libraries_are_loaded_before_they_are_needed():
         "import numpy as np; g.OwnVoiceGate().push(np.zeros(640, np.float32))\n"
         "assert not {'torch', 'scipy'} & set(sys.modules)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=dict(os.environ)
-    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -54,8 +54,7 @@ def test_samples_and_mel_rows_tell_the_same_story_and_hum_is_forgotten_within_a_
     rows, _ = mel.log_mel(audio, mel.start())
     heard = phase.hear(voice_activity.mel_levels_db(rows[: 4 * len(truth)].reshape(-1, 4, mel.MEL_BINS)))
     assert (np.array(heard) == truth[: len(heard)]).mean() > 0.95
-    rng = np.random.default_rng(0)
-    hum = 0.02 * rng.standard_normal(75 * 16_000)
+    hum = 0.02 * np.random.default_rng(0).standard_normal(75 * 16_000)
     heard = phase.hear(voice_activity.levels_db(hum.astype(np.float32)))
     assert not any(heard[-15 * 25 :])
 
@@ -92,8 +91,7 @@ def test_times_are_those_of_the_pattern(active):
 def test_hats_add_up_to_one_and_reproduce_knots(speech_s, silence_s, last_s):
     row = phase.features(np.array([[speech_s, silence_s, last_s]]))[0]
     a, b = len(SPEECH_KNOTS_S), len(SPEECH_KNOTS_S) + len(SILENCE_KNOTS_S)
-    assert row.min() >= 0
-    assert row[:a].sum() == pytest.approx(float(speech_s > 0), abs=1e-6)
+    assert row.min() >= 0 and row[:a].sum() == pytest.approx(float(speech_s > 0), abs=1e-6)
     assert row[a:b].sum() == pytest.approx(1, abs=1e-6)
     assert row[b:].sum() == pytest.approx(float(last_s > 0), abs=1e-6)
 

@@ -124,12 +124,9 @@ def test_a_face_goes_to_action_units_and_back_by_one_table():
     face[POSE][:3] = 0.25, -0.125, 0.5
     units = units_of(face)
     assert units["intensity"][[12, 26, 1, 63]] == pytest.approx([0.1, 0.5, 0.7, 0.9])
-    assert units["intensity"][[51, 52, 53, 54, 55, 56]] == pytest.approx(
-        np.array([0.5, 0, 0.125, 0, 0, 0.25]) * 4 / np.pi
-    )
+    assert units["intensity"][51:57] == pytest.approx(np.array([0.5, 0, 0.125, 0, 0, 0.25]) * 4 / np.pi)
     assert (units["confidence"] > 0).sum() == 34 and not units["intensity"][units["confidence"] == 0].any()
-    read = from_cdr(ACTION_UNITS, to_cdr(ACTION_UNITS, units))
-    np.testing.assert_allclose(face_of(read), face, atol=1e-6)
+    np.testing.assert_allclose(face_of(from_cdr(ACTION_UNITS, to_cdr(ACTION_UNITS, units))), face, atol=1e-6)
     lost = {
         name for name in BLENDSHAPES if not face_of(units_of(np.eye(58, dtype=np.float32)[CHANNEL_INDEX[name]])).any()
     }

@@ -26,8 +26,7 @@ def test_axes_are_a_rotation(space):
 
 
 def test_faceverse_and_back_is_the_same_face():
-    motion = faces()
-    neutral = spaces.encode(np.zeros((1, 58)))[0]
+    motion, neutral = faces(), spaces.encode(np.zeros((1, 58)))[0]
     frames = spaces.encode(motion, metres_per_unit=1.0)
     back, jaw_rad = spaces.decode(frames, "faceverse58", neutral=neutral, metres_per_unit=1.0)
     assert np.abs(back - motion).max() < 1e-5 and jaw_rad is None
@@ -37,8 +36,7 @@ def test_faceverse_neutral_looks_straight_ahead_and_its_translation_has_no_metri
     frame = np.zeros((1, 58))
     frame[0, 52] = np.pi
     assert np.abs(spaces.decode(frame, "faceverse58")[0]).max() < 1e-6
-    frames = spaces.encode(faces())
-    assert not spaces.decode(frames, "faceverse58")[0][:, 3:6].any()
+    assert not spaces.decode(spaces.encode(faces()), "faceverse58")[0][:, 3:6].any()
 
 
 @pytest.mark.parametrize(("index", "channel"), [(50, "pitch"), (51, "yaw"), (52, "roll")])
@@ -56,8 +54,7 @@ def test_without_a_matrix_pose_and_jaw_move_and_it_says_so():
     motion, jaw_rad = spaces.decode(frames, "deca56")
     assert "pose and jaw only" in (spaces.limitation("deca56", None) or "")
     shapes = motion[:, SHAPES]
-    assert shapes[:, BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5)
-    assert np.count_nonzero(shapes) == len(frames)
+    assert shapes[:, BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5) and np.count_nonzero(shapes) == len(frames)
     assert jaw_rad is not None and jaw_rad[:, 1] == pytest.approx(spaces.JAW_FULL_OPEN_RAD / 2)
 
 

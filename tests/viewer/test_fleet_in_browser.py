@@ -10,11 +10,7 @@ from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
 
 pytest.importorskip("zenoh", reason="needs the extra [remote]")
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}"),
-    pytest.mark.realtime,
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=f"needs {missing()}"), pytest.mark.realtime]
 
 TILES = "[...document.querySelectorAll('#heads li')]"
 NAMES = ("hall", "kitchen")

@@ -10,11 +10,7 @@ from sfms_robot.app.options import RunOptions
 from sfms_robot.app.session import run as record
 from sfms_robot.face.human import load_human
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}"),
-    pytest.mark.realtime,
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=f"needs {missing()}"), pytest.mark.realtime]
 
 HUMAN = "human-cell"
 WINDOW, PHONE = (1000, 700), (390, 844)
@@ -96,8 +92,7 @@ def test_loads_without_a_complaint_and_asks_nobody_but_this_machine(page):
         "page.timeline.frames.length > 30 && page.stage.robot"
         " && document.querySelectorAll('#controls > details').length > 4"
     )
-    assert page.complaints() == []
-    assert page.addresses() <= {"127.0.0.1", "data", "blob", "about"}
+    assert page.complaints() == [] and page.addresses() <= {"127.0.0.1", "data", "blob", "about"}
     assert page.ask("document.getElementById('notice').hidden")
 
 
@@ -128,11 +123,9 @@ def test_a_blink_is_seen_where_the_eyes_are(page):
 
 def test_a_nod_moves_head_and_hair_and_not_the_shoulders(page):
     still = hold(page, pitch=0.0, yaw=0.0, roll=0.0)
-    down = hold(page, pitch=0.25, yaw=0.0, roll=0.0)
-    change = np.abs(down - still).mean(axis=2)
+    change = np.abs(hold(page, pitch=0.25, yaw=0.0, roll=0.0) - still).mean(axis=2)
     high = len(change)
-    assert change[: high // 2].mean() > 4
-    assert change[: high // 2].mean() > 5 * change[int(0.86 * high) :].mean()
+    assert change[: high // 2].mean() > 4 and change[: high // 2].mean() > 5 * change[int(0.86 * high) :].mean()
 
 
 @pytest.mark.parametrize("way", ["click", "Escape", "space"])
@@ -352,8 +345,7 @@ def test_halt_stays_where_it_is_whatever_is_told_beside_it(page):
         "page.still = true; document.getElementById('state-why').textContent = 'left_eyebrow_outer, '.repeat(40)"
     )
     try:
-        assert page.ask(place) == before
-        assert page.ask("document.documentElement.scrollWidth") <= WINDOW[0]
+        assert page.ask(place) == before and page.ask("document.documentElement.scrollWidth") <= WINDOW[0]
     finally:
         page.ask("(page.still = false, 1)")
 

@@ -209,13 +209,6 @@ def test_of_nobody_but_the_holder_voice_and_face_are_taken(page):
     assert holder.get(timeout=WAIT_S)[0] == "left"
 
 
-def test_without_a_run_a_command_is_refused_in_words(page):
-    page.answered_by(None)
-    with visit(page) as visitor:
-        says(visitor, "halt")
-        assert heard(visitor, "error")["error"] == "no run is on"
-
-
 def test_nonsense_is_refused_in_a_line_and_the_visitor_stays(page):
     with visit(page) as visitor:
         for text in ("", "[]", '{"type":"show"}', "9" * 9000):
@@ -363,12 +356,6 @@ def test_beyond_loopback_a_token_is_made_and_asked_for(tmp_path):
             assert asked.next() == ("halt", {})
         assert code_of(f"http://127.0.0.1:{port}/recording") == 403
         assert got(f"http://127.0.0.1:{port}/recording?token={page.token}")[0] == b"recorded"
-
-
-@pytest.mark.parametrize("wanted", ["-1", "65536", "http", "", ":80", "host:", "١"])
-def test_what_is_no_port_is_refused_in_one_line(wanted):
-    with pytest.raises(ConfigError, match=r"^--view .*not a TCP port"):
-        Address.parsed(wanted)
 
 
 def test_an_address_that_is_not_this_machines_is_refused_in_one_line():

@@ -9,11 +9,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.face.drawing import VirtualWebcam
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}"),
-    pytest.mark.realtime,
-]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=f"needs {missing()}"), pytest.mark.realtime]
 
 VOICE = data_dir("sim") / "speakers" / "katie" / "speech.flac"
 FRAMES = 50
