@@ -13,7 +13,7 @@ from sfms_robot.lab.corpora.collection import Clip, Dataset
 from sfms_robot.lab.evaluation import listener_tables as tables
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.metrics import cut
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, offline_rollout, rollout, rollouts
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, offline_rollout, rollout, rollouts
 from sfms_robot.listeners.sfms.stream import SfmsListener
 
 COLUMNS = {1: ("L2", "FD", "Var", "SI", "P-FD", "RPCC"), 2: ("FRCorr", "FRDist", "FRDiv", "FRVar", "FRDvs", "FRSyn")}
@@ -178,3 +178,17 @@ def test_random_has_the_moments_of_even_numbers_in_the_range_of_training():
     assert metrics.frdiv(shapes) == pytest.approx(1 / 6, rel=0.02)
     assert metrics.frdvs(shapes) == pytest.approx(1 / 6, rel=0.02)
     assert 0 <= pose.min() and pose.max() <= 0.1
+
+
+# --- `evaluate --hop N`: the hops that a run may choose, and no other ------------------------------------------------
+@pytest.mark.parametrize(("hop", "plans_every"), [(None, 4), (2, 2), (8, 8)])
+def test_a_listener_plans_as_often_as_it_is_told(hop, plans_every):
+    assert load_at_hop("sfms-small", hop).hop == plans_every
+
+
+@pytest.mark.parametrize(
+    ("listener", "hop", "choices"), [("sfms-small", 9, "1, 2, 3, 4, 5, 6, 7, 8"), ("arig-small", 2, "1")]
+)
+def test_a_hop_that_it_cannot_be_run_with_is_refused_with_the_choices(listener, hop, choices):
+    with pytest.raises(ConfigError, match=rf"^--hop {hop}: not a hop of listener {listener} \(valid: {choices}\)$"):
+        load_at_hop(listener, hop)

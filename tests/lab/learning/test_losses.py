@@ -1,7 +1,11 @@
+import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from sfms_robot.lab.learning.sfms.predictor_trainer import next_tokens
+from sfms_robot.lab.evaluation.metrics import dtw
+from sfms_robot.lab.learning.sfms.predictor_trainer import keyframe_dtw, next_tokens, soft_dtw
 from sfms_robot.lab.learning.sfms.tokenizer_trainer import masking, reconstruction
 
 MEMBER = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
@@ -37,3 +41,33 @@ def test_next_token_loss_is_weighted_cross_entropy_of_the_counted_frames():
     counted = torch.tensor([[True, True, False]])
     expected = (0.2 * -torch.tensor(0.5).log() - torch.tensor(0.8).log()) / 1.2
     torch.testing.assert_close(next_tokens([logits], target, counted, 0.2, [1.0]), expected)
+
+
+@pytest.mark.parametrize("frames", [(8, 8), (3, 7), (1, 4), (5, 1)])
+def test_the_gradient_is_that_of_finite_differences(frames: tuple[int, int]):
+    cost = torch.rand(3, *frames, dtype=torch.float64, generator=torch.Generator().manual_seed(0), requires_grad=True)
+    assert torch.autograd.gradcheck(lambda c: soft_dtw(c, 0.3), (cost,))
+
+
+@given(st.integers(1, 6), st.integers(1, 6), st.integers(0, 2**31))
+def test_with_hard_minima_it_is_the_squared_dtw(rows: int, columns: int, seed: int):
+    rng = np.random.default_rng(seed)
+    a, b = rng.normal(size=(rows, 1)), rng.normal(size=(columns, 1))
+    cost = torch.from_numpy((a - b.T) ** 2)[None]
+    assert float(soft_dtw(cost, 1e-4)) == pytest.approx(dtw(a, b[None])[0] ** 2, abs=5e-3)
+
+
+def test_a_keyframe_one_frame_late_costs_less_than_none_and_more_than_in_time():
+    def indicator(*frames: int) -> torch.Tensor:
+        out = torch.zeros(1, 8, 1)
+        out[:, list(frames)] = 1.0
+        return out
+
+    in_time, late, none = (float(keyframe_dtw(one, indicator(3), 0.01)) for one in
+                           (indicator(3), indicator(4), indicator()))  # fmt: skip
+    assert in_time <= late < none
+
+
+def test_a_gamma_that_is_not_above_0_is_refused():
+    with pytest.raises(ValueError, match="gamma 0 must be above 0"):
+        soft_dtw(torch.zeros(1, 2, 2), 0.0)
