@@ -346,12 +346,12 @@ class Ros2Node:
         (self._seen.add if sample.kind == zenoh.SampleKind.PUT else self._seen.discard)(known)
 
     def _take(self, topic: str, sample: zenoh.Sample) -> None:
-        self.counts["received"] += 1
         try:
             self._received(topic, "/".join(str(sample.key_expr).split("/")[-2:]), sample.payload.to_bytes())
         except RobotError as error:
             self.counts["refused"] += 1
             self._say(topic, str(error))
+        self.counts["received"] += 1  # once it has been taken
 
     def _say(self, topic: str, reason: str) -> None:
         key = topic + re.sub(r"[\d.]+", "", reason)
