@@ -20,9 +20,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sfms_robot.app.listen.knobs import LiveKnobs, turned
+from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.report import (
-    Drove,
     OutletObserver,
     Report,
     event_watch,
@@ -54,7 +53,6 @@ from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.sources.registry import open_source, split_kind
 
 if TYPE_CHECKING:
-    from sfms_robot.outputs.sender import Outputs
     from sfms_robot.sources.net_person import PageVisitor
     from sfms_robot.sources.push import Spoken
 
@@ -86,11 +84,11 @@ def drive_head(
     *,
     duration_s: float | None = None,
     log: RunLog | None = None,
-) -> Drove:
-    """Switch torque on, run the loop, come to rest, switch torque off. Blocks until then.
+) -> Report:
+    """Switch torque on, run the loop, come to rest, switch torque off, and report. Blocks until then.
 
-    An exception on the way is kept, not raised: the head is at rest and the report is still to be made. A drive that
-    would end as done or interrupted ends as failed, by TorqueError, where torque could not be confirmed off.
+    An exception on the way is reported, not raised: the head is at rest. A drive that would end as done or interrupted
+    ends as failed, by TorqueError, where torque could not be confirmed off.
 
     Args:
         duration_s: None without an end.
@@ -124,7 +122,7 @@ def drive_head(
         if log.torque_unconfirmed and error is None:
             outcome, error = "failed", TorqueError(log.torque_unconfirmed)
         log.ended(opened.clock.now_s(), error)
-    return Drove(outcome=outcome, log=log, elapsed_s=elapsed_s, priority=priority, error=error)
+    return run_report(opened, log, parts.feed, outcome, elapsed_s, error) | {"priority": priority}
 
 
 # --- what other threads may do to a run ------------------------------------------------------------------------------
@@ -230,7 +228,7 @@ def run(
 
             outputs = stack.enter_context(closing(Outputs(sinks, joints)))
         duration_s = person.duration_s if options.duration_s is None else options.duration_s
-        figures = partial(_figures, opened, log, person, feed, knobs, outputs, more)
+        figures = partial(figures_so_far, opened, log, person, feed, knobs, outputs, more)
         status = RunStatus(joints, {**facts, "duration_s": duration_s}, figures)
         controls.document = status.document
         watchers: list[Observer] = [status, *observers]
@@ -267,12 +265,12 @@ def run(
             opened, person, feed, knobs=lambda: knobs.now, overlay=overlay, halt=halt, observers=watchers, **played,
             missing=(lambda: outputs.missing) if outputs else tuple,
         )  # fmt: skip
-        drove = drive_head(opened, parts, interrupt, duration_s=duration_s, log=log)
+        report = drive_head(opened, parts, interrupt, duration_s=duration_s, log=log)
         status.ended(log.states[-1][1])
         if outputs is not None:
             outputs.close()
-        report = run_report(opened, drove, feed, facts["listener"], options.seed)
-        report |= {"source": dict(person.statistics()), "limitation": limited, **more()}
+        report |= {"listener": facts["listener"], "seed": options.seed, "source": dict(person.statistics())}
+        report |= {"limitation": limited, **more()}
         report["outputs"] = [] if outputs is None else outputs.statistics()
         report |= {"wire": opened.digests()} if options.fast else {}
         if recorder is not None:
@@ -390,23 +388,3 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
         feed = begin_listening(options)
     stack.callback(feed.close)
     return feed
-
-
-def _figures(
-    opened: OpenHead,
-    log: RunLog,
-    person: Source,
-    feed: PlanFeed,
-    live: LiveKnobs,
-    outputs: Outputs | None,
-    more: Document,
-) -> Report:
-    """Return the figures of the status document, at this moment."""
-    return {
-        **figures_so_far(log, opened.rate_hz, real=not opened.options.fast),
-        "source": dict(person.statistics()),
-        "listener_state": dict(feed.statistics()),
-        "intensity": live.values["intensity"],
-        **more(),
-        **({} if outputs is None else {"outputs": outputs.statistics()}),
-    }

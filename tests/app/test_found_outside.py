@@ -8,7 +8,7 @@ import pytest
 
 from sfms_robot.app.open_head import OpenHead, build_bus, build_motion
 from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import drive_head, run_parts
+from sfms_robot.app.session import drive_head, run_log, run_parts
 from sfms_robot.app.wiring import calibration_of, plugged_in
 from sfms_robot.config import load_head
 from sfms_robot.config.head import held_back
@@ -77,12 +77,12 @@ def driven(head, servos, seconds, seed, fault=None):
         motion = build_motion(head, rate_hz)
         there = OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
         began_s = clock.now_s()
-        parts = run_parts(there, silence, InlineFeed(Restless(), seed, 0.01))
-        drove = drive_head(there, parts, Interrupt(), duration_s=seconds)
+        parts, log = run_parts(there, silence, InlineFeed(Restless(), seed, 0.01)), run_log(there)
+        report = drive_head(there, parts, Interrupt(), duration_s=seconds, log=log)
         stand = {name: opened[joint.bus].state(joint.id) for name, joint in head.joints.items()}
-    assert (drove.outcome, drove.error) == ("done", None)
+    assert (report["exit"], report["error"]) == ("done", None)
     assert not any(state["torque"] for state in stand.values())
-    return drove.log, motion, clock.now_s() - began_s, {name: state["position"] for name, state in stand.items()}
+    return log, motion, clock.now_s() - began_s, {name: state["position"] for name, state in stand.items()}
 
 
 def far_from_rest(head, whole, stand):

@@ -13,7 +13,7 @@ import pytest
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import HeadOptions, RunOptions
-from sfms_robot.app.session import drive_head, run, run_parts
+from sfms_robot.app.session import drive_head, run, run_log, run_parts
 from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
 from sfms_robot.ports import Source
 from sfms_robot.runtime.safety import Interrupt, Released
@@ -84,16 +84,16 @@ class Ending(NobodyThere):
 
 
 def drive(how=0, fault=None, bus=lambda bus: bus):
-    """A drive of 0.4 s, and whether each servo has torque after it. `fault` begins when torque is on."""
+    """The report and log of a drive of 0.4 s, and if each servo has torque after it. `fault`: from torque on."""
     interrupt = Interrupt()
     with open_head(HeadOptions(head=HEAD, fast=True)) as opened:
         chain = opened.opened["main"]
         if fault is not None:
             chain.inject(f"{fault}@{opened.clock.now_s() + 0.2}-1000")
         there = replace(opened, bus=bus(opened.bus))
-        parts = run_parts(there, Ending(how, interrupt), NobodyThere())
-        drove = drive_head(there, parts, interrupt, duration_s=0.4)
-        return drove, [chain.state(joint.id)["torque"] for joint in opened.config.joints.values()]
+        parts, log = run_parts(there, Ending(how, interrupt), NobodyThere()), run_log(there)
+        report = drive_head(there, parts, interrupt, duration_s=0.4, log=log)
+        return report, log, [chain.state(joint.id)["torque"] for joint in opened.config.joints.values()]
 
 
 @pytest.mark.parametrize("fault", [None, "silent", "silent:2"])
@@ -112,18 +112,19 @@ def drive(how=0, fault=None, bus=lambda bus: bus):
     ids=str,
 )
 def test_torque_that_is_not_confirmed_off_overrides_success_and_interruption_and_no_error(how, code, fault):
-    drove, torques = drive(how, fault)
+    report, log, torques = drive(how, fault)
     named = {None: [], "silent": ["pan", "tilt"], "silent:2": ["tilt"]}[fault]
-    assert drove.log.torque_unconfirmed == named and torques == [joint in named for joint in ("pan", "tilt")]
+    assert report["torque_unconfirmed"] == log.torque_unconfirmed == named
+    assert torques == [joint in named for joint in ("pan", "tilt")]
     own = code in (0, 130)
-    assert drove.exit_code == (4 if named and own else code)
-    assert drove.log.states[-1][1].name == ("fault" if named or not own else "stopped")
+    assert report["exit_code"] == (4 if named and own else code)
+    assert log.states[-1][1].name == ("fault" if named or not own else "stopped")
     if named and own:
         told = (
             f"torque of {', '.join(named)} could not be confirmed off: run sfms-robot servo release or switch off "
             "the supply before you touch it"
         )
-        assert (drove.outcome, str(drove.error)) == ("failed", told)
+        assert (report["exit"], report["error"]) == ("failed", told)
 
 
 class CutShort:
@@ -144,5 +145,5 @@ class CutShort:
 
 @pytest.mark.parametrize(("fault", "code"), [(None, 130), ("silent", 4)])
 def test_a_second_interrupt_in_the_middle_of_stop_does_not_skip_the_confirmation(fault, code):
-    drove, torques = drive(1, fault, CutShort)
-    assert (drove.exit_code, any(torques)) == (code, fault is not None)
+    report, _, torques = drive(1, fault, CutShort)
+    assert (report["exit_code"], any(torques)) == (code, fault is not None)

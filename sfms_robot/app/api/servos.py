@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.listen.report import Report, failure, run_report
+from sfms_robot.app.listen.report import Report, failure
 from sfms_robot.app.open_head import open_head
 from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.session import drive_head, run_parts
@@ -307,8 +307,7 @@ class Servos(Driven):
     def _drive(self, now: Background) -> Report:
         opened, alone = self._opened, NobodyThere()
         parts = run_parts(opened, alone, alone, retargeter=self._target, halt=now.halt, observers=[now])
-        drove = drive_head(opened, parts, now.interrupt)
-        return run_report(opened, drove, alone, "none", 0)
+        return drive_head(opened, parts, now.interrupt)
 
 
 class _Target:

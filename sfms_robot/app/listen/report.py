@@ -8,8 +8,8 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,13 +21,15 @@ from sfms_robot.errors import INTERRUPTED, BusError, ConfigError, ModelError, Po
 from sfms_robot.frames import EVENT_KINDS, ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.plugins import listener_folder
-from sfms_robot.ports import Outlet, PlanFeed, Tick
+from sfms_robot.ports import Outlet, PlanFeed, Source, Tick
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.planned_events import EventWatch
 
 if TYPE_CHECKING:
+    from sfms_robot.app.listen.knobs import LiveKnobs
     from sfms_robot.app.open_head import OpenHead
     from sfms_robot.app.options import RunOptions
+    from sfms_robot.outputs.sender import Outputs
 
 Report = dict[str, Any]  # plain data, as --json prints it
 
@@ -37,27 +39,16 @@ OUTCOME: Final = ("version", "head", "port", "exit", "exit_code", "error", "torq
 _KINDS: Final = {kind.exit_code: kind for kind in (ConfigError, PortError, BusError, ModelError)}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Drove:
-    """The end of a drive: "done", "interrupted" or "failed", and then the error."""
+def run_report(
+    opened: OpenHead, log: RunLog, feed: PlanFeed, outcome: str, elapsed_s: float | None, error: Exception | None
+) -> Report:
+    """Return version 1 of the report of a drive without a listener; a run adds its own.
 
-    outcome: str
-    log: RunLog
-    elapsed_s: float | None
-    priority: str
-    error: Exception | None = None
-
-    @property
-    def exit_code(self) -> int:
-        """Exit code of the process: see `errors`."""
-        if self.outcome == "interrupted":
-            return INTERRUPTED
-        return 0 if self.error is None else getattr(self.error, "exit_code", 1)
-
-
-def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, seed: int) -> Report:
-    """Return version 1 of the report. In virtual time wall-clock figures are null."""
-    log = drove.log
+    Args:
+        outcome: "done", "interrupted" or "failed", and then there is an `error`.
+        elapsed_s: of the drive; None in virtual time, where wall-clock figures are null.
+    """
+    code = 0 if error is None else getattr(error, "exit_code", 1)  # of the process: see `errors`
     heard = dict(feed.statistics())
     timeline, limiter = (getattr(log.state, part, None) for part in ("timeline", "limiter"))
     plans = _counts(timeline, ("held", "eased", "late", "refused"))
@@ -65,17 +56,17 @@ def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, se
         "version": 1,
         "head": opened.config.name,
         "port": opened.options.port,
-        "exit": drove.outcome,
-        "exit_code": drove.exit_code,
-        "error": None if drove.error is None else str(drove.error),
-        "torque_unconfirmed": drove.log.torque_unconfirmed,
-        "listener": listener,
-        "seed": seed,
+        "exit": outcome,
+        "exit_code": INTERRUPTED if outcome == "interrupted" else code,
+        "error": None if error is None else str(error),
+        "torque_unconfirmed": log.torque_unconfirmed,
+        "listener": "none",
+        "seed": 0,
         "duration_s": round(log.listened_s, 4),
         "frames": log.frames,
         "ticks": log.ticks,
-        "tick": log.tick_report(opened.rate_hz, drove.elapsed_s),
-        "latency_ms": _latency(log, drove.elapsed_s is not None),
+        "tick": log.tick_report(opened.rate_hz, elapsed_s),
+        "latency_ms": _latency(log, elapsed_s is not None),
         "listener_step_ms": heard.pop("step_ms"),
         "hop": heard.pop("hop", None),
         "budget_ms": heard.pop("budget_ms", None),
@@ -92,7 +83,6 @@ def run_report(opened: OpenHead, drove: Drove, feed: PlanFeed, listener: str, se
         "attention": log.attention_report(),
         "plans": {**plans, "refused": plans.get("refused", 0) + log.refused_plans},
         "observers_detached": dict(log.detached),
-        "priority": drove.priority,
     }
 
 
@@ -103,18 +93,29 @@ def failure(report: Report) -> RobotError | None:
     return _KINDS.get(report["exit_code"], RobotError)(report["error"])
 
 
-def figures_so_far(log: RunLog, rate_hz: float, *, real: bool) -> Report:
-    """Return the figures of the report that are known while it runs, under the report's names. From any thread.
-
-    `real` False means virtual time.
-    """
+def figures_so_far(
+    opened: OpenHead,
+    log: RunLog,
+    person: Source,
+    feed: PlanFeed,
+    live: LiveKnobs,
+    outputs: Outputs | None,
+    more: Callable[[], Mapping[str, Any]],
+) -> Report:
+    """Return the figures of the report that are known while it runs, under the report's names. From any thread."""
+    real = not opened.options.fast
     return {
         "torque_unconfirmed": log.torque_unconfirmed,
         "frames": log.frames,
         "ticks": log.ticks,
-        "tick": log.tick_report(rate_hz, log.listened_s + (1 + log.eased) * log.period_s if real else None),
+        "tick": log.tick_report(opened.rate_hz, log.listened_s + (1 + log.eased) * log.period_s if real else None),
         "latency_ms": _latency(log, real),
         "motion": log.motion_so_far(),
+        "source": dict(person.statistics()),
+        "listener_state": dict(feed.statistics()),
+        "intensity": live.values["intensity"],
+        **more(),
+        **({} if outputs is None else {"outputs": outputs.statistics()}),
     }
 
 
