@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import cast, get_args
 
+from sfms_robot.app.options import Report
 from sfms_robot.app.output_paths import made_folder
 from sfms_robot.app.progress import bar
-from sfms_robot.config import load_head
-from sfms_robot.config.listener import load_listener
+from sfms_robot.config import load_head, load_listener
 from sfms_robot.data import data_dir, find, head_names, listener_names, speaker_names
 from sfms_robot.errors import ConfigError, RobotError, optional
 from sfms_robot.listeners.checkpoint import WEIGHTS, Bits, read_weights, write_tensors
@@ -16,12 +16,9 @@ from sfms_robot.outputs.registry import DESCRIPTIONS, output_kinds
 from sfms_robot.servo.discovery import ports_data
 from sfms_robot.sources.registry import shipped_speaker
 
-Row = dict[str, Any]
 
-
-def shipped_heads() -> list[Row]:
+def shipped_heads() -> list[Report]:
     """Return the rows of `head list`."""
-    heads = [load_head(name) for name in head_names()]
     return [
         {
             "name": head.name,
@@ -30,11 +27,11 @@ def shipped_heads() -> list[Row]:
             "neck": head.kinematics.kind if head.kinematics else None,
             "buses": {name: bus.family for name, bus in head.buses.items()},
         }
-        for head in heads
+        for head in map(load_head, head_names())
     ]
 
 
-def shipped_listeners() -> list[Row]:
+def shipped_listeners() -> list[Report]:
     """Return the rows of `listener list`."""
     folder = data_dir("configs") / "listeners"
     rows = []
@@ -51,7 +48,7 @@ def shipped_listeners() -> list[Row]:
     return rows
 
 
-def shipped_speakers() -> list[Row]:
+def shipped_speakers() -> list[Report]:
     """Return the rows of `speaker list`; the description is the title of SOURCE.md."""
     import soundfile
 
@@ -70,7 +67,7 @@ def shipped_speakers() -> list[Row]:
     return rows
 
 
-def outputs() -> list[Row]:
+def outputs() -> list[Report]:
     """Return the rows of `output list`, those of other packages too. `name` begins the value for --output."""
     return [
         {"name": name, "description": DESCRIPTIONS.get(name, f"of package {entry.dist.name if entry.dist else '?'}")}
@@ -78,12 +75,12 @@ def outputs() -> list[Row]:
     ]
 
 
-def ports() -> Row:
+def ports() -> Report:
     """Return the tables of `port list`; the name of a serial port is the value for --port. Blocks for a second.
 
     The description of a sound device names the option for it. Without PortAudio, `microphone_problem` says so.
     """
-    found: Row = {"ports": ports_data(), "microphones": [], "loudspeakers": [], "microphone_problem": None}
+    found: Report = {"ports": ports_data(), "microphones": [], "loudspeakers": [], "microphone_problem": None}
     try:
         found |= {"microphones": _sound_devices(playing=False), "loudspeakers": _sound_devices(playing=True)}
     except RobotError as error:
@@ -91,7 +88,7 @@ def ports() -> Row:
     return found
 
 
-def _sound_devices(playing: bool) -> list[Row]:
+def _sound_devices(playing: bool) -> list[Report]:
     from sfms_robot.sources import sound_devices
 
     def option(monitor: bool) -> str:
@@ -113,7 +110,7 @@ def _sound_devices(playing: bool) -> list[Row]:
 # --- export -------------------------------------------------------------------------------------------------------
 
 
-def export_listener(name: str, out: Path | None, int8: bool, weight_bits: int | None = None) -> list[Path]:
+def export_listener(name: str, out: Path | None, int8: bool, weight_bits: int | None) -> list[Path]:
     """Write the graphs of a listener, by shipped name or folder, below its folder or `out`, and return the files.
 
     `int8`: also graphs with large layers in 8 bits. `weight_bits`: also the weights, stored in 8, 16 or 32 bits (see

@@ -25,23 +25,20 @@ import os
 import secrets
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
-from sfms_robot.app.listen.knobs import LiveKnobs
-from sfms_robot.config import Calmness
-from sfms_robot.config.base import Finite, one_line, parse
+from sfms_robot.app.listen.knobs import RunControls
+from sfms_robot.config.base import Finite, one_line
 from sfms_robot.data import user_dir
 from sfms_robot.endpoint import LOOPBACK
 from sfms_robot.errors import ConfigError, PortError, RobotError
-from sfms_robot.network import AWAY_S, LOCAL, Connection, Router, check_name, session_config
-from sfms_robot.ports import Observer, Tick
-from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.safety import Interrupt
+from sfms_robot.network import AWAY_S, Connection, Router, check_name, session_config
+from sfms_robot.ports import Facts, Observer, Tick
 
 if TYPE_CHECKING:
     import zenoh
@@ -57,8 +54,6 @@ PAGE: Final = Path(__file__).with_name("fleet_page.html")
 _LONGEST: Final = 4096
 _LONGEST_NAME: Final = 80
 _SHORTEST_KEY: Final = 32
-
-Document = Mapping[str, Any]
 
 log = logging.getLogger(__name__)
 
@@ -127,65 +122,53 @@ class FleetControls:
     """Carries out commands on a run, from any thread.
 
     Args:
+        run: the controls of the run.
         name: of the head; `key`: of the fleet (`fleet_key`), which `_Keyed` commands need; None where none is needed.
 
     Attributes:
         nonce: goes into the proof of the next command that needs the key.
     """
 
-    def __init__(
-        self,
-        halt: HaltLatch,
-        interrupt: Interrupt,
-        knobs: LiveKnobs,
-        calm: Callable[[Calmness], None] | None,
-        name: str = "",
-        key: bytes | None = None,
-    ) -> None:
+    def __init__(self, run: RunControls, name: str = "", key: bytes | None = None) -> None:
         self._lock = threading.Lock()
         self.nonce = secrets.token_hex(8)
-        self._halt, self._interrupt, self._knobs, self._calm = halt, interrupt, knobs, calm
-        self._name, self._key = name, key
+        self.run, self.name, self._key = run, name, key
 
     def halt(self, by: str) -> None:
         """Halt; `by` is the name that the client gives itself."""
         name = "".join(each for each in by if each.isprintable())[:_LONGEST_NAME].strip()
-        self._halt.close(name or "the fleet", "fleet")
+        self.run.halt.close(name or "the fleet", "fleet")
 
     def obey(self, message: bytes) -> dict[str, str]:
         """Return the effect of a command, or why it has none. Never raises."""
         try:
             command = _COMMAND.validate_json(message if len(message) <= _LONGEST else b"")
-            self._do(command)
+            match command:
+                case _Halt():
+                    self.halt(str(command.by))
+                case _Keyed():
+                    if self._key is not None:
+                        self._check_proof(command, self._key)
+                    if command.command == "end":
+                        self.run.interrupt.ask()
+                    else:
+                        self.run.halt.resume("fleet")
+                case _Calm():
+                    if self.run.set_rates is None:
+                        raise ConfigError("calm: this run's listener decides no events")
+                    self.run.calm(command.rates)
+                case _Knobs():
+                    self.run.knobs.turn(command.intensity, command.style)
         except ValidationError as error:
             return {"error": " ".join(one_line(error.errors()[0]).split())}
         except RobotError as error:
             return {"error": str(error).splitlines()[0]}
         return {"done": command.command}
 
-    def _do(self, command: _Command) -> None:
-        match command:
-            case _Halt():
-                self.halt(str(command.by))
-            case _Keyed():
-                if self._key is not None:
-                    self._check_proof(command, self._key)
-                if command.command == "end":
-                    self._interrupt.ask()
-                else:
-                    self._halt.resume("fleet")
-            case _Calm():
-                calmness = parse(Calmness, command.rates, "calm")
-                if self._calm is None:
-                    raise ConfigError("calm: this run's listener decides no events")
-                self._calm(calmness)
-            case _Knobs():
-                self._knobs.turn(command.intensity, command.style)
-
     def _check_proof(self, command: _Keyed, key: bytes) -> None:
         """Raise ConfigError unless a command comes from a holder of the key; the nonce is used up then."""
         with self._lock:
-            wanted = proof(key, self._name, command.command, self.nonce)
+            wanted = proof(key, self.name, command.command, self.nonce)
             given = str(command.proof).encode(errors="replace")
             if not hmac.compare_digest(wanted.encode(), given):
                 raise ConfigError(
@@ -198,21 +181,14 @@ class FleetHead(Observer):
     """`ports.Observer` that sends the state of a run to the fleet, in a thread.
 
     Args:
-        name: of this head among others.
-        document: returns the state that is sent.
+        controls: of the run, by the name of this head among others.
         router: that joins the fleet.
 
     Raises ConfigError, MissingExtra.
     """
 
-    def __init__(
-        self,
-        name: str,
-        document: Callable[[], Document],
-        controls: FleetControls,
-        router: Router = LOCAL,
-    ) -> None:
-        self._name, self._document, self._controls = fleet_name(name), document, controls
+    def __init__(self, controls: FleetControls, router: Router) -> None:
+        self._name, self._controls = fleet_name(controls.name), controls
         self._connection = Connection(session_config("call", router))
         self._news, self._over = threading.Event(), False
         self._malformed = 0
@@ -256,8 +232,13 @@ class FleetHead(Observer):
             self._news.clear()
 
     def _state_json(self) -> bytes:
-        more = {"name": self._name, "nonce": self._controls.nonce, "malformed": self._malformed}
-        return json.dumps({**self._document(), **more}, allow_nan=False).encode()
+        document = {
+            **self._controls.run.document(),
+            "name": self._name,
+            "nonce": self._controls.nonce,
+            "malformed": self._malformed,
+        }
+        return json.dumps(document, allow_nan=False).encode()
 
     def _on_query(self, query: zenoh.Query) -> None:
         answer = self._obey(b"" if query.payload is None else query.payload.to_bytes())
@@ -279,7 +260,7 @@ class FleetHead(Observer):
 
 
 @contextmanager
-def open_fleet(zenoh: Path | None = None, insecure: bool = False, key: Path | None = None) -> Iterator[Fleet]:
+def open_fleet(zenoh: Path | None, insecure: bool = False, key: Path | None = None) -> Iterator[Fleet]:
     """Connect to the router that joins the heads, while inside. Blocks for `AWAY_S` at most.
 
     Raises PortError when no router answers, ConfigError, MissingExtra.
@@ -302,20 +283,19 @@ class Fleet:
         self._session, self._key = session, key
         self.malformed = 0
 
-    def states(self) -> list[Document]:
+    def states(self) -> list[Facts]:
         """Return the status document of every head that answers, by name. Blocks for `ASK_S` at most."""
-        found = self._ask(f"{ROOT}/*/state", b"")
-        return sorted(found, key=lambda each: str(each.get("name")))
+        return sorted(self._ask(f"{ROOT}/*/state", b""), key=lambda each: str(each.get("name")))
 
-    def command(self, heads: Sequence[str], command: Document) -> list[Document]:
+    def command(self, heads: Sequence[str], command: Facts) -> list[Facts]:
         """Send a command to `heads`, or all where none is named; return their answers."""
         keys = [f"{ROOT}/{fleet_name(head)}/command" for head in heads] or [f"{ROOT}/*/command"]
         return [answer for key in keys for answer in self._ask(key, json.dumps(dict(command)).encode())]
 
-    def resume(self, heads: Sequence[str]) -> list[Document]:
+    def resume(self, heads: Sequence[str]) -> list[Facts]:
         """Resume `heads`, or all, by the fleet's key. Raises ConfigError for a key that cannot be used."""
         key = fleet_key(self._key)
-        answers: list[Document] = []
+        answers: list[Facts] = []
         for each in self.states():
             name = str(each.get("name"))
             if not heads or name in heads:
@@ -323,24 +303,24 @@ class Fleet:
                 answers += self.command([name], {"command": "resume", "proof": signed})
         return answers
 
-    def halt(self, heads: Sequence[str], by: str) -> list[Document]:
+    def halt(self, heads: Sequence[str], by: str) -> list[Facts]:
         """Halt `heads`, or all; sent twice: on the keys for halting, which need no answer, and as a command."""
         for key in [f"{ROOT}/{fleet_name(head)}/halt" for head in heads] or [f"{ROOT}/*/halt"]:
             self._session.put(key, by.encode())
         return self.command(heads, {"command": "halt", "by": by})
 
-    def follow(self, receive: Callable[[Document], None]) -> None:
+    def follow(self, receive: Callable[[Facts], None]) -> None:
         """Call `receive` with every document from now on, in a thread of zenoh's."""
         self._session.declare_subscriber(f"{ROOT}/*/state", lambda sample: self._read(sample, receive))
 
-    def _ask(self, key: str, payload: bytes) -> list[Document]:
-        answers: list[Document] = []
+    def _ask(self, key: str, payload: bytes) -> list[Facts]:
+        answers: list[Facts] = []
         for reply in self._session.get(key, payload=payload, timeout=ASK_S):
             if reply.ok is not None:
                 self._read(reply.ok, answers.append)
         return answers
 
-    def _read(self, sample: Any, receive: Callable[[Document], None]) -> None:
+    def _read(self, sample: Any, receive: Callable[[Facts], None]) -> None:
         try:
             given = json.loads(sample.payload.to_bytes())
         except (ValueError, RecursionError):
@@ -353,7 +333,7 @@ class Fleet:
             log.warning("fleet: %s: expected a JSON document of a head (more are only counted)", sample.key_expr)
 
 
-def tile(name: str, document: Document, age_s: float = 0.0) -> dict[str, Any]:
+def tile(name: str, document: Facts, age_s: float = 0.0) -> dict[str, Any]:
     """Return a summary of a head; `here` False: without news for `GONE_S`, or it has ended."""
     state = str(document.get("state", "?"))
     return {
@@ -381,9 +361,9 @@ def fleet_page(fleet: Fleet, port: int) -> LocalServer:
 
     from sfms_robot.viewer.web_server import LocalServer, json_body
 
-    newest: dict[str, tuple[float, Document]] = {}  # of each head, and when it came
+    newest: dict[str, tuple[float, Facts]] = {}  # of each head, and when it came
 
-    def put(document: Document) -> None:
+    def put(document: Facts) -> None:
         newest[str(document.get("name", "?"))] = time.monotonic(), document
 
     for document in fleet.states():

@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sfms_robot.app.options import SIM, HeadOptions, RunOptions
+from sfms_robot.app.options import SIM, HeadOptions, Report, RunOptions
 from sfms_robot.app.servo.serial_line import Wire
 from sfms_robot.app.wiring import Opened, calibration_of, devices, open_wires, port_of
 from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map, load_head
@@ -85,12 +85,12 @@ class OpenHead:
         """Rate of the loop: that of the head's fastest bus."""
         return fastest_hz(self.config)
 
-    def readings(self) -> dict[str, Any]:
+    def readings(self) -> Report:
         """Return what the servos report, torque untouched."""
         polled = self.bus.poll(self.clock.now_s()).items()
         return {joint: {"position_rad": each.position_rad, "fault": each.fault} for joint, each in polled}
 
-    def digests(self) -> dict[str, Any]:
+    def digests(self) -> Report:
         """Return SHA-256 and count of the bytes on each emulated wire, by which runs are compared."""
         digests = {name: chain.digest() for name, chain in self.opened.items() if isinstance(chain, Chain)}
         return {name: {"sha256": sha256, "bytes": count} for name, (sha256, count) in digests.items()}
@@ -150,8 +150,9 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
         motion = build_motion(head, fastest_hz(head))
         opened = stack.enter_context(open_wires(head, options.port, options.fast))
         doctor = doctor_command(options.head, options.port)
-        confirmed = options.confirmed
-        bus = build_bus(head, opened, clock, confirmed=confirmed, without=options.without, doctor=doctor, kept=kept)
+        bus = build_bus(
+            head, opened, clock, confirmed=options.confirmed, without=options.without, doctor=doctor, kept=kept
+        )
         stack.callback(bus.close)
         bus.connect()
         if weak := bus.statistics().get("stored_warnings"):
@@ -216,7 +217,7 @@ def identify(
         elif mine:
             port = port_of(where[name], bus, clock)()
             try:
-                wire = Wire(port, bus.family, clock, bus.baud, fixed=True)
+                wire = Wire(port, bus.family, bus.baud, fixed=True)
                 servos |= {joint: _identity(wire, head.joints[joint]) for joint in mine}
             finally:
                 if kept is None:
@@ -258,7 +259,7 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
         limiter=JerkLimiter(limits, 1.0 / rate_hz),
         audit=CommandAudit(limits, calibration_of(head.joints), 1.0 / rate_hz),
         leads_s=leads_s,
-        rest_rad=np.array([joint.rest_rad for joint in head.joints.values()]),
+        rest_rad=head.rest_rad,
         holds=holds,
         heat=HeatGuard(
             np.array([each.warm_C for each in safety]), np.array([each.hot_C for each in safety]), neck.tolist()
@@ -330,7 +331,7 @@ def build_one(
     family = family_named(config.family)
     if family.board:
         rest_rad = np.array([joint.rest_rad for joint in joints.values()])
-        more: dict[str, Any] = {"confirmed": confirmed or isinstance(where, Chain), "rest_rad": rest_rad}
+        more: Report = {"confirmed": confirmed or isinstance(where, Chain), "rest_rad": rest_rad}
     else:
         more = {"faults": head.faults}
     deadline_s = config.read_deadline_ms / 1e3
@@ -338,11 +339,12 @@ def build_one(
         deadline_s = max(deadline_s, where.read_deadline_s)
         if not where.virtual:  # a busy computer would trip it, and no servo is in danger
             config = config.replaced(watchdog_ms=0)
+    open_port = port_of(where, config, clock)  # named while the adapter is there: it may come back as another ttyUSB
     return family.build(
         name,
         servos,
         calibration_of(joints),
-        lambda: kept.pop(name, None) or port_of(where, config, clock)(),
+        lambda: kept.pop(name, None) or open_port(),
         config.baud,
         deadline_s,
         config=config,

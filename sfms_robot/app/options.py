@@ -9,10 +9,10 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.data import NO_HEAD, head_file
 from sfms_robot.errors import ConfigError
@@ -29,10 +29,12 @@ if TYPE_CHECKING:
     from sfms_robot.viewer.page_process import PageProcess
 
 Names = tuple[str, ...]
+Report = dict[str, Any]  # plain data, as --json prints it
 
 SIM: Final = "sim"  # the port of emulated servos
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
 RECORD_FORMATS: Final[tuple[RecordFormat, ...]] = ("json", "ros2")
+FEEDS: Final = ("voice", "face")  # of a person
 PAGE: Final = "sfms_robot.app.head.head_scene:main"
 _IN_TERMINALS: Final = ("www-browser", "links", "elinks", "lynx", "w3m", "browsh")
 
@@ -47,6 +49,7 @@ class HeadOptions:
         fast: virtual time; needs emulated servos.
         yes: hobby servos may jump when they come on.
         without: joints whose servos are not addressed at all.
+        dry_run: of a run: torque stays off.
     """
 
     head: str = "face28"
@@ -54,11 +57,12 @@ class HeadOptions:
     fast: bool = False
     yes: bool = False
     without: Names = ()
+    dry_run: bool = False
 
     @property
     def confirmed(self) -> bool:
-        """True if hobby servos may be connected, which makes them jump."""
-        return self.yes
+        """True if hobby servos may be connected, which makes them jump where torque comes on."""
+        return self.yes or self.dry_run
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +86,6 @@ class RunOptions(HeadOptions):
     record: Path | None = None
     record_format: RecordFormat = "json"
     overwrite: bool = False
-    dry_run: bool = False
     halt_on: str | None = None
     status: str | None = None
     fleet: str | None = None
@@ -93,11 +96,6 @@ class RunOptions(HeadOptions):
     outputs: Names = ()
 
     @property
-    def confirmed(self) -> bool:
-        """True in a dry run too: no servo comes on."""
-        return self.yes or self.dry_run
-
-    @property
     def router(self) -> Router:
         """Router of a fleet, or of a listener on another machine."""
         return Router(self.zenoh, self.insecure)
@@ -106,6 +104,17 @@ class RunOptions(HeadOptions):
     def hears(self) -> str:
         """`audio`, where "default" is the microphone for servos that are not emulated here."""
         return "mic" if self.audio == "default" and self.port != SIM and not self.dry_run else self.audio
+
+    @property
+    def listener_name(self) -> str:
+        """`listener` without its folder or server, for people."""
+        return Path(self.listener).name
+
+    @property
+    def visitor_feeds(self) -> list[str]:
+        """Those of `FEEDS` that a visitor of the page brings."""
+        given = zip(FEEDS, (self.hears, self.face), strict=True)
+        return [feed for feed, kind in given if split_kind(kind)[0] == BROWSER]
 
 
 _DEFAULTS: Final = RunOptions()
@@ -148,6 +157,36 @@ def record_format_named(name: str) -> RecordFormat:
     return name
 
 
+def values_by_name(
+    option: str, given: Sequence[str], form: str = "REGION=VALUE with a value from 0 to 2"
+) -> dict[str, float]:
+    """Return the numbers of an option that is given as NAME=NUMBER, several times. Raises ConfigError."""
+    values = {}
+    for text in given:
+        region, _, value = text.partition("=")
+        try:
+            values[region] = float(value)
+        except ValueError:
+            raise ConfigError(f"{option} {text!r} is not {form}") from None
+    return values
+
+
+def words_of(values: Mapping[str, float]) -> Names:
+    """Return the words NAME=NUMBER that `values_by_name` reads."""
+    return tuple(f"{name}={value}" for name, value in values.items())
+
+
+def calmed(per_minute: Sequence[str], addressed: str) -> Calmness:
+    """Return the rates of `--calmness` and `--addressed`. Raises ConfigError for an unknown kind or an invalid rate."""
+    from sfms_robot.config import Calmness, parse
+    from sfms_robot.frames import EVENT_KINDS
+
+    rates = values_by_name("--calmness", per_minute, "KIND=EVENTS A MINUTE")
+    if unknown := [kind for kind in rates if kind not in EVENT_KINDS]:
+        raise ConfigError(f"--calmness {unknown[0]}: no kind of event ({', '.join(EVENT_KINDS)})")
+    return parse(Calmness, {**rates, "addressed": addressed}, "--calmness, --addressed")
+
+
 def begin_listening(options: RunOptions) -> NamedFeed:
     """Return the listener, which loads or connects from now on, for `session.run(feed=...)`. The caller closes it."""
     from sfms_robot.listeners.remote import open_feed
@@ -164,7 +203,7 @@ def begin_page(
     what no page can show.
     """
     if address is None:
-        if BROWSER not in (split_kind(options.audio)[0], split_kind(options.face)[0]):
+        if not options.visitor_feeds:
             if certificate is not None or key is not None:
                 raise ConfigError("--view-cert, --view-key: no page is served (--view)")
             return None

@@ -79,8 +79,11 @@ def rich_bar(*figures: ProgressColumn, transient: bool) -> Iterator[RichProgress
     Log lines appear above them.
     """
     stderr = sys.stderr
-    every = [each for each in logging.getLogger().handlers if isinstance(each, logging.StreamHandler)]
-    handlers = [each for each in every if each.stream is stderr]
+    handlers = [
+        each
+        for each in logging.getLogger().handlers
+        if isinstance(each, logging.StreamHandler) and each.stream is stderr
+    ]
     bars = RichProgress(
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),

@@ -12,18 +12,16 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.knobs import RunControls
 from sfms_robot.app.listen.report import (
     OutletObserver,
-    Report,
     event_watch,
     figures_so_far,
     limitation,
@@ -31,20 +29,17 @@ from sfms_robot.app.listen.report import (
     run_report,
 )
 from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
-from sfms_robot.app.options import RunOptions, begin_listening
-from sfms_robot.config import Calmness, Head, parse
+from sfms_robot.app.options import Report, RunOptions, begin_listening
 from sfms_robot.endpoint import leads_here
 from sfms_robot.errors import NOTE, ConfigError, RobotError, TorqueError
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.network import session_config
 from sfms_robot.plugins import REMOTE, listener_folder
-from sfms_robot.ports import Observer, Output, PlanFeed, Source, Timeline
+from sfms_robot.ports import Facts, Observer, Output, PlanFeed, Source, Timeline
 from sfms_robot.processes import realtime_priority
-from sfms_robot.retarget.head_retargeter import HeadRetargeter
-from sfms_robot.retarget.puppet import Puppet
 from sfms_robot.retarget.spontaneous import HeadLife
 from sfms_robot.runtime.clock import InlineFeed
-from sfms_robot.runtime.halt import HaltLatch, halt_signals, halt_switch
+from sfms_robot.runtime.halt import halt_signals, halt_switch
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.observers import NotifyingObserver, RunStatus, ServiceManager
@@ -52,16 +47,14 @@ from sfms_robot.runtime.recorder import Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.sources.registry import open_source, split_kind
 
-if TYPE_CHECKING:
-    from sfms_robot.sources.net_person import PageVisitor
-    from sfms_robot.sources.push import Spoken
-
 logger = logging.getLogger(__name__)
 
 LOOK_S: Final = 2.0  # for which a point holds that the peer of an output asks to look at
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 
-Document = Callable[[], Mapping[str, Any]]
+Panel = Callable[[RunControls], AbstractContextManager[object]]
+
+
 # --- any motion on a head -------------------------------------------------------------------------------------------
 
 
@@ -125,48 +118,6 @@ def drive_head(
     return run_report(opened, log, parts.feed, outcome, elapsed_s, error) | {"priority": priority}
 
 
-# --- what other threads may do to a run ------------------------------------------------------------------------------
-
-
-class RunControls:
-    """Commands on a run from any thread: a page, a fleet, keys, a program. Motion stays under the head's limits.
-
-    Attributes:
-        interrupt: ends the run.
-        halt: emergency stop.
-        knobs: scale of each region.
-        puppet: faces over the listener's plan.
-        calmness: rates of events.
-        set_rates: of the listener; None: not begun, or in virtual time.
-        visitor: the person in front of a page. speech: what a program lets the robot say.
-        document: returns the status of the run; an empty one before it begins.
-    """
-
-    def __init__(self, head: Head, options: RunOptions) -> None:
-        self.interrupt, self.halt = Interrupt(), HaltLatch()
-        self.knobs = turned(head, options.intensity, options.style)
-        self.puppet = Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
-        self.calmness = options.calmness or Calmness()
-        self.set_rates: Callable[[Calmness], None] | None = None
-        self.document: Document = dict
-        self.visitor: PageVisitor | None = None
-        self.speech: Spoken | None = None
-
-    def calm(self, rates: Mapping[str, Any]) -> None:
-        """Set rates of events per minute; the others stay. Raises ConfigError for an unknown kind or a bad rate."""
-        self.calmness = parse(Calmness, {**self.calmness.model_dump(), **rates}, "calm")
-        if self.set_rates is not None:
-            self.set_rates(self.calmness)
-
-    def release(self) -> None:
-        """Take torque off at once, as a second Ctrl-C does; the run ends with it."""
-        self.interrupt.ask()
-        self.interrupt.ask()
-
-
-Panel = Callable[[RunControls], AbstractContextManager[object]]
-
-
 # --- a person, a listener, a head -----------------------------------------------------------------------------------
 
 
@@ -179,7 +130,7 @@ def run(
     observers: Sequence[Observer] = (),
     timeline: Timeline | None = None,
     controls: RunControls | None = None,
-    more: Document = dict,
+    more: Callable[[], Facts] = dict,
     signals: bool = True,
 ) -> Report:
     """Listen until the duration is over or the run is interrupted. Blocks until then, and returns the report.
@@ -200,10 +151,10 @@ def run(
     _check(options)
     limited = limitation(options.listener) if feed is None or isinstance(feed, ListenerProcess) else None
     if limited is not None:
-        logger.warning("%s: %s", Path(options.listener).name, limited)
+        logger.warning("%s: %s", options.listener_name, limited)
     controls = controls or RunControls(head, options)
     interrupt, halt, knobs = controls.interrupt, controls.halt, controls.knobs
-    facts = {"head": head.name, "port": options.port, "listener": Path(options.listener).name}
+    facts = {"head": head.name, "port": options.port, "listener": options.listener_name}
     with ExitStack() as stack:  # until all is closed again
         if signals:
             stack.enter_context(signals_to(interrupt))
@@ -256,8 +207,11 @@ def run(
         if (manager := ServiceManager()).wanted:
             watchers.append(NotifyingObserver(manager))
         if options.fleet is not None:
-            watch(_fleet_head(options.fleet, options, controls))
-        played: dict[str, Any] = {"timeline": timeline}
+            from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key
+
+            reach = FleetControls(controls, options.fleet, fleet_key(options.fleet_key))
+            watch(FleetHead(reach, options.router))
+        played: Report = {"timeline": timeline}
         if timeline is None:
             played = {"life": HeadLife(head.life, options.seed, head.camera), "answers": True}
         overlay = controls.puppet.overlay
@@ -303,15 +257,6 @@ def _check(options: RunOptions) -> None:
         check_folder(options.record, options.overwrite)
     elif options.record_format != "json":
         raise ConfigError(f"--record-format {options.record_format}: nothing is recorded (--record DIR)")
-
-
-def _fleet_head(name: str, options: RunOptions, controls: RunControls) -> Observer:
-    """Return the observer that sends a run to its fleet, whose commands act on `controls`."""
-    from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key
-
-    key = fleet_key(options.fleet_key)
-    reach = FleetControls(controls.halt, controls.interrupt, controls.knobs, controls.set_rates, name, key)
-    return FleetHead(name, controls.document, reach, options.router)
 
 
 def _outputs(options: RunOptions, controls: RunControls, stack: ExitStack) -> list[Output]:

@@ -193,8 +193,7 @@ def sagging_joints(head: Head) -> frozenset[str]:
     neck = head.kinematics
     if neck is None or neck.kind != "serial" or "pitch" not in neck.axes:
         return frozenset()
-    pitch = neck.axes["pitch"]
-    return frozenset([pitch] if isinstance(pitch, str) else [pitch.lower, pitch.upper])
+    return frozenset(neck.joints_of("pitch"))
 
 
 def sagged_rad(joint: Joint, sags: bool) -> float:

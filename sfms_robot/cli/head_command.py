@@ -205,7 +205,7 @@ def calibrate(
 
     outcome = lead_through(name, port, partial(print, flush=True), input, joint, again)
     print()  # ends the line of the last question
-    show(outcome.as_dict(), json, heading="{head}: {exit}, written to {file}")
+    show(outcome.model_dump(mode="json"), json, heading="{head}: {exit}, written to {file}")
     if outcome.torque_unconfirmed:
         aside(f"sfms-robot: {TorqueError(outcome.torque_unconfirmed)}")
     if outcome.problems:

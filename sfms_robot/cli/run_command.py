@@ -160,16 +160,12 @@ def run(
         RunOptions,
         begin_listening,
         begin_page,
+        calmed,
         check_names,
         engine_named,
         record_format_named,
     )
 
-    calm = None
-    if calmness or addressed != "sense":
-        from sfms_robot.app.listen.knobs import calmed
-
-        calm = calmed(calmness, addressed)
     options = RunOptions(
         head=head,
         port=port,
@@ -186,7 +182,7 @@ def run(
         engine=engine_named(engine),
         intensity=tuple(intensity),
         style=tuple(style),
-        calmness=calm,
+        calmness=calmed(calmness, addressed) if calmness or addressed != "sense" else None,
         record=record,
         record_format=record_format_named(record_format),
         overwrite=overwrite,

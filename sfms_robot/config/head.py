@@ -192,6 +192,11 @@ class Head(Model):
             raise all_of(found)
         return self
 
+    @property
+    def rest_rad(self) -> Doubles:
+        """(J,) angles at rest."""
+        return np.array([joint.rest_rad for joint in self.joints.values()])
+
     def safety_of(self, joint: str) -> Safety:
         return self.safety.merged(self.joints[joint].safety)
 

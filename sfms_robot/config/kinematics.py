@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from typing import Annotated, Literal
 
 import numpy as np
@@ -77,16 +78,19 @@ class SerialNeck(Model):
 
     def joints(self) -> tuple[str, ...]:
         """Return every joint that the neck moves, from the base up; a differential has its two at its first axis."""
-        names: list[str] = []
-        for axis in self.order:
-            place = self.axes.get(axis)
-            if isinstance(place, str):
-                names.append(place)
-            elif place is not None:
-                names += [place.lower, place.upper]
-            elif self.differential is not None and axis == next(a for a in self.order if a not in self.axes):
-                names += [self.differential.left, self.differential.right]
-        return tuple(names)
+        geared = next((axis for axis in self.order if axis not in self.axes), None)
+        turning = [self.joints_of(axis) for axis in self.order if axis in self.axes or axis == geared]
+        return tuple(chain.from_iterable(turning))
+
+    def joints_of(self, axis: str) -> tuple[str, ...]:
+        """Return the joints that turn about one axis; none about one that the neck does not have."""
+        pair = self.differential
+        place = next((place for name, place in self.axes.items() if name == axis), None)
+        if isinstance(place, str):
+            return (place,)
+        if place is not None:
+            return place.lower, place.upper
+        return (pair.left, pair.right) if pair is not None and axis != "yaw" else ()
 
 
 class Leg(Model):
@@ -134,7 +138,11 @@ class StewartPlatform(Model):
 
     def joints(self) -> tuple[str, ...]:
         """Return the joint of body yaw, if any, then those of the legs in order."""
-        body = (self.body_yaw.joint,) if self.body_yaw else ()
+        return self.joints_of("yaw")
+
+    def joints_of(self, axis: str) -> tuple[str, ...]:
+        """Return the joints that move the head about or along one axis: all legs, and for yaw the body's first."""
+        body = (self.body_yaw.joint,) if self.body_yaw and axis == "yaw" else ()
         return (*body, *(leg.joint for leg in self.legs))
 
 

@@ -79,7 +79,7 @@ class RobotScene:
         self.left_out = list(self.robot.left_out)
         self._find_meshes(head.folder or Path(), description.packages, packages)
         self._names = tuple(head.joints)
-        self._rest = np.array([joint.rest_rad for joint in head.joints.values()])
+        self._rest = head.rest_rad
         self._read = self._rest.copy()  # the last angles that were finite
         follows = _following(head, self.robot, urdf, description)
         self.follows = {name: each.joint for name, each in follows.items()}

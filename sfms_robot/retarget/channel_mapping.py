@@ -59,7 +59,7 @@ class Units:
     @classmethod
     def of(cls, head: Head) -> Units:
         joints = head.joints.values()
-        rest = np.array([joint.rest_rad for joint in joints])
+        rest = head.rest_rad
         up = np.array([joint.max_rad for joint in joints]) - rest
         down = rest - np.array([joint.min_rad for joint in joints])
         in_rad = np.array([joint.unit == "rad" for joint in joints], np.bool_)

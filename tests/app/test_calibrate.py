@@ -176,7 +176,7 @@ def test_a_joint_whose_torque_is_not_confirmed_off_at_its_end_is_named(name, ans
         outcome = led(name, chain, Person("k", "5", "", "20", "", cable_out), joints=["jaw"])
         assert chain.state(1)["torque"]
     assert (outcome.measured, outcome.exit) == (measured, "done" if measured else "interrupted")
-    assert outcome.as_dict()["torque_unconfirmed"] == ["jaw"]
+    assert outcome.model_dump(mode="json")["torque_unconfirmed"] == ["jaw"]
 
 
 def test_nobody_is_told_to_move_a_joint_by_hand_whose_torque_is_not_confirmed_off(name):

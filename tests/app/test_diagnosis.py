@@ -108,13 +108,13 @@ def test_a_bus_that_is_too_slow_is_told_what_takes_the_time(wire, blamed):
 
 def test_findings_alike_are_one_the_worst_come_first_and_an_unknown_model_is_named_once():
     notes = [diagnosis.Finding("note", f"id {i}", "slow", "do {id}", servo=i) for i in (3, 1, 2)]
-    out = diagnosis.grouped([*notes, *diagnosis.judge_duplicate_ids([7], LINE)])
+    out = diagnosis.grouped([*notes, diagnosis.duplicate_id(7, LINE)])
     assert [(each.severity, each.about) for each in out] == [("error", "id 7"), ("note", "ids 1-3")]
     assert out[1].fix == "do 1-3"
     wanted = {1: diagnosis.Wanted(joint="jaw", model="sts3215", model_number=777, faults=Faults())}
     seen = FoundServo(id=1, baud=BAUD, model_number=2307, firmware=3, firmware_minor=9, table=None, wire=None)
     line = diagnosis.Line(device="/dev/ttyUSB0", shown="/dev/ttyUSB0", family="feetech", wanted=wanted)
-    (found,) = diagnosis.judge_presence(line, {1: seen}, {}, BAUD)
+    (found,) = diagnosis.judge_presence(line, [seen], BAUD)
     assert found.problem == "unknown (2307) answers, the head says sts3215 (777)"
 
 

@@ -3,8 +3,9 @@
 import re
 import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import typer
@@ -15,6 +16,7 @@ from sfms_robot.app.servo.serial_line import Wire
 from sfms_robot.app.servo.single_servo import checked_ids, reboot, set_baud, write_register
 from sfms_robot.cli.main import app
 from sfms_robot.config import Faults, Threshold, load_firmware_map, map_files
+from sfms_robot.data import head_file
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
@@ -45,14 +47,14 @@ class Patient:
             bus="face", device=self.chain.device, shown="/dev/ttyUSB0", family="dynamixel2", baud=BAUD,
             rate_hz=rate_hz, wanted=self.wanted,
         )  # fmt: skip
-        open_port = port or (lambda device, baud: self.port(baud))
-        return examine_line(replace(usual, **line), self.clock, open_port, fix=fix)
+        line = replace(usual, **line)
+        return examine_line(line, port or partial(self.port, line.first_baud), fix=fix)
 
     @contextmanager
     def wire(self) -> Iterator[Wire]:
         port = self.port()
         try:
-            yield Wire(port, "dynamixel2", self.clock, BAUD)
+            yield Wire(port, "dynamixel2", BAUD)
         finally:
             port.close()
 
@@ -87,6 +89,8 @@ def test_a_sound_chain_is_fit_to_run_and_looking_changes_nothing():
 
 
 TWO = "two servos seem to answer to this id (or the wire is disturbed)"
+SWAPPED = "id 2 (joint2): xl330-m077 (1190) answers, the head says xl330-m288 (1200)"
+UNNAMED = "id 40: xl330-m288 at 1000000 baud is not in the head's file"
 OTHERS = [EmulatedServo(1), EmulatedServo(2, model="xl330-m077"), EmulatedServo(3), EmulatedServo(40)]
 
 
@@ -97,20 +101,8 @@ OTHERS = [EmulatedServo(1), EmulatedServo(2, model="xl330-m077"), EmulatedServo(
         ([], "echo=1", [], [], ""),  # an adapter that hears itself
         ([], "silent:2", ["id 2 (joint2): no answer, at any rate"], [], "servo scan.*set-id OLD NEW"),
         ([], "silent", ["bus: no answer at any rate: none of 3 servos"], [], "power"),
-        (
-            [],
-            "duplicate:2=1",
-            ["id 2: two servos seem to answer to this id (or the wire is disturbed)"],
-            [],
-            "set-id 2",
-        ),
-        (
-            OTHERS,
-            "",
-            ["id 2 (joint2): xl330-m077 (1190) answers, the head says xl330-m288 (1200)"],
-            ["id 40: xl330-m288 at 1000000 baud is not in the head's file"],
-            "cables swapped",
-        ),
+        ([], "duplicate:2=1", [f"id 2: {TWO}"], [], "set-id 2"),
+        (OTHERS, "", [SWAPPED], [UNNAMED], "cables swapped"),
     ],
 )
 def test_trouble_is_named_once_with_what_to_do(servos, harm, errors, warnings, fix):
@@ -164,7 +156,7 @@ def test_a_port_that_vanishes_meanwhile_is_a_finding():
             return super().read(n, deadline_s)
 
     with patient() as sick:
-        report = sick.examined(port=lambda device, baud: Loose(device, sick.chain.control, baud, sick.clock))
+        report = sick.examined(port=lambda: Loose(sick.chain.device, sick.chain.control, BAUD, sick.clock))
     assert report["exit_code"] == 4 and "gone" in report["findings"][0]["problem"]
 
 
@@ -284,8 +276,7 @@ def test_a_maestro_answers_where_its_crc_setting_is_that_of_the_heads_file(store
 # --- ports ------------------------------------------------------------------------------------------------------
 def no_port(path: str) -> dict:
     line = Line(device=path, shown=path, family="dynamixel2", baud=BAUD, rate_hz=100.0, wanted={})
-    clock = RealClock()
-    return examine_line(line, clock, lambda device, baud: SerialPort(device, baud, clock))
+    return examine_line(line, partial(SerialPort, path, BAUD, RealClock()))
 
 
 def test_a_port_that_is_none_and_unknown_families_and_heads_end_it_at_once(tmp_path):
@@ -299,12 +290,17 @@ def test_a_port_that_is_none_and_unknown_families_and_heads_end_it_at_once(tmp_p
 
 def test_a_port_that_somebody_holds_ends_in_three():
     with patient() as sick:
-        holder = SerialPort(sick.chain.device, BAUD, sick.clock)
-        try:
+        with closing(SerialPort(sick.chain.device, BAUD, sick.clock)):
             report = no_port(sick.chain.device)
-        finally:
-            holder.close()
     assert report["exit_code"] == 3 and len(report["findings"]) >= 1
+
+
+def test_the_port_of_a_head_is_opened_as_its_run_opens_it(tmp_path):
+    text = head_file("op3_head").read_text()
+    (tmp_path / "head.yaml").write_text(text.replace("rate_hz: 100}", "rate_hz: 100, rs485: rts}"))
+    with patient() as sick:  # a pseudo terminal has no RTS line
+        report = examine(sick.chain.device, str(tmp_path), None, None)
+    assert report["exit_code"] == 3 and "rs485 = 'rts': this device has no RTS line" in str(report["findings"])
 
 
 # --- what servos have stored ------------------------------------------------------------------------------------

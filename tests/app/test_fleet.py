@@ -5,24 +5,26 @@ import json
 import pytest
 
 from sfms_robot.app.fleet import GONE_S, FleetControls, fleet_key, fleet_name, proof, tile
-from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.knobs import RunControls
+from sfms_robot.app.options import RunOptions
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
-from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.safety import Interrupt
+
+
+class Run(RunControls):
+    """The controls of a run, and what was asked of its listener."""
+
+    def __init__(self):
+        super().__init__(load_head("face28"), RunOptions())
+        self.calmed = []
+        self.set_rates = self.calmed.append
+
+    def obey(self, **command):
+        return FleetControls(self).obey(json.dumps(command).encode())
 
 
 @pytest.fixture
 def run():
-    """The parts of a run that a fleet reaches, and what was asked of its listener."""
-
-    class Run:
-        halt, interrupt, knobs, calmed = HaltLatch(), Interrupt(), turned(load_head("face28")), []
-
-        def obey(self, **command):
-            controls = FleetControls(self.halt, self.interrupt, self.knobs, self.calmed.append)
-            return controls.obey(json.dumps(command).encode())
-
     return Run()
 
 
@@ -46,7 +48,7 @@ KEY = b"k" * 64
 
 @pytest.mark.parametrize("command", ["resume", "end"])
 def test_resume_and_end_need_a_proof_of_the_key_which_counts_once(run, command):
-    controls = FleetControls(run.halt, run.interrupt, run.knobs, None, "hall", KEY)
+    controls = FleetControls(run, "hall", KEY)
     assert controls.obey(b'{"command": "halt", "by": "kitchen"}') == {"done": "halt"}  # needs no key
 
     def sent(**more):
@@ -84,7 +86,9 @@ def test_a_key_is_made_for_its_owner_alone_and_one_that_others_can_read_is_refus
 
 
 def test_calm_and_knobs_are_turned(run):
-    assert run.obey(command="calm", rates={"nod": 3.0}) == {"done": "calm"} and run.calmed[0].nod == 3.0
+    run.calm({"smile": 2.0, "addressed": "never"})  # as a page does
+    assert run.obey(command="calm", rates={"nod": 3.0}) == {"done": "calm"}
+    assert (run.calmed[1].nod, run.calmed[1].smile, run.calmed[1].addressed) == (3.0, 2.0, "never")
     region = next(iter(run.knobs))
     assert run.obey(command="knobs", intensity={region: 0.5}) == {"done": "knobs"}
     assert run.knobs[region].intensity == 0.5
@@ -113,7 +117,7 @@ def test_what_cannot_be_obeyed_is_one_line(run, command, said):
      b'{"command": "knobs", "intensity": {"neck": 1' + 400 * b"0" + b"}}"],
 )  # fmt: skip
 def test_nonsense_is_answered_and_does_nothing(run, message):
-    assert "error" in FleetControls(run.halt, run.interrupt, run.knobs, None).obey(message)
+    assert "error" in FleetControls(run).obey(message)
     assert run.halt.by is None and not run.interrupt()
 
 

@@ -6,7 +6,7 @@ from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.wiring import emulated, plugged_in
 from sfms_robot.config import Head, Safety, load_head, parse
 from sfms_robot.emulator.launch import EmulatedServo, launch
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.runtime.clock import RealClock, VirtualClock
 
 
@@ -53,6 +53,15 @@ def test_current_limit_that_cannot_be_kept_is_refused():
     head = head.model_copy(update={"joints": {**head.joints, "jaw": jaw}})
     with pytest.raises(ConfigError, match="current_limit_mA = 300.* be kept: xl430-w250 cannot limit its current"):
         build_bus(head, {"face": "/dev/null", "neck": "/dev/null"}, RealClock())
+
+
+def test_an_adapter_is_named_while_it_is_there_so_that_it_is_found_again_under_another_device(monkeypatch):
+    looks: list[str] = []
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: looks.append("looked") or [])
+    bus = build_bus(load_head("op3_head"), {"main": "/dev/ttyUSB99"}, RealClock())
+    with pytest.raises(PortError):
+        bus.connect()
+    assert looks == ["looked"]
 
 
 def bus_of(family, model, safety, faults=None) -> Head:

@@ -19,7 +19,7 @@ PROGRAM = """
 import logging, os, sys, threading
 from sfms_robot.app.listen.panel import live_panel
 from sfms_robot.app.options import RunOptions
-from sfms_robot.app.session import RunControls
+from sfms_robot.app.listen.knobs import RunControls
 from sfms_robot.config import load_head
 from sfms_robot.runtime.safety import signals_to
 

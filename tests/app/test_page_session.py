@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
+from sfms_robot.app.listen.knobs import RunControls
 from sfms_robot.app.listen.page_session import LEFT_S, EndsAlone, PageSession, page_session
 from sfms_robot.app.options import RunOptions, begin_page
 from sfms_robot.app.replay.run_file import read_recording
-from sfms_robot.app.session import RunControls
 from sfms_robot.config import Calmness, load_head
 from sfms_robot.data import data_dir
 from sfms_robot.errors import RobotError

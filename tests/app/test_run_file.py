@@ -2,7 +2,6 @@
 
 import json
 import tracemalloc
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ from recorded_runs import JOINTS, record
 
 from sfms_robot.app.replay.run_file import read_recording, summary
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_S, FaceFrame, Plan, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, FRAME_S, Plan, SpeakerFrame
 from sfms_robot.ports import Tick
 from sfms_robot.runtime import recorder as recorder_module
 from sfms_robot.runtime.recorder import RUN_FILE, Recorder
@@ -26,22 +25,18 @@ def test_what_was_recorded_is_read_back(tmp_path):
     assert run.motion.shape == (200, 58) and len(run.audio) == 50 * 640
     assert np.isnan(run.speaker[1::2]).all() and (run.speaker[::2] == 0.25).all()
     assert run.states == [(0.0, "listening", ()), (1.5, "halted", ("key",))]
-    np.testing.assert_allclose(run.servos_s, [0.0, 1.0])
-    assert set(run.servos) == {"temperature_C"}
-    np.testing.assert_array_equal(run.servos["temperature_C"], [[40.0, np.nan, np.nan], [41.0, np.nan, np.nan]])
+    assert run.hottest_C == 41.0
 
 
-def test_the_heads_own_voice_and_jaws_are_read_back_beside_the_persons(tmp_path):
+def test_the_heads_own_voice_is_read_back_beside_the_persons(tmp_path):
     recorder = Recorder(tmp_path, JOINTS, when_full="wait")
     recorder.tick(Tick(0.0, np.zeros(58, np.float32), np.zeros(3), {}))
     for index in range(3):
-        face = replace(FaceFrame.of(0.0, np.zeros(58)), jaw_rad=np.float32([0, 0.25, 0])) if index else None
         said = np.full(640, 0.25 * (index + 1), np.float32)  # of the frame that comes next, as sources give it
-        recorder.heard(SpeakerFrame((index + 1) * FRAME_S, np.zeros(640, np.float32), face, said))
+        recorder.heard(SpeakerFrame((index + 1) * FRAME_S, np.zeros(640, np.float32), None, said))
     recorder.close()
     run = read_recording(tmp_path)
     np.testing.assert_allclose(run.agent_audio[::640], [0.0, 0.25, 0.5], atol=2e-5)
-    np.testing.assert_array_equal(run.speaker_jaw_rad, [[np.nan] * 3, [0, 0.25, 0], [0, 0.25, 0]])
 
 
 def test_events_that_plans_held_are_read_back(tmp_path):

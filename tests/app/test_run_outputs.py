@@ -13,9 +13,10 @@ from free_ports import free_tcp_port, free_udp_port
 from pythonosc.osc_packet import OscPacket
 from websockets.sync.client import connect
 
+from sfms_robot.app.listen.knobs import RunControls
 from sfms_robot.app.options import RunOptions
 from sfms_robot.app.replay.run_file import read_recording
-from sfms_robot.app.session import RunControls, run
+from sfms_robot.app.session import run
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES

@@ -19,19 +19,17 @@ from sfms_robot.servo.stored_settings import limit_names
 MODELS = {"xl330-m288": "dynamixel2", "xl-320": "dynamixel2", "ax-12a": "dynamixel1", "sts3215": "feetech"}
 
 
-class Watched:
-    """The servo's state each time the clock is waited for."""
+class Watched(WrappedPort):
+    """A port that keeps the servo's state each time its clock is waited for."""
 
     def __init__(self, wire, chain):
-        self.wire, self.chain, self.clock, self.seen = wire, chain, wire.clock, []
-
-    def now_s(self):
-        return self.clock.now_s()
+        super().__init__(wire.port)
+        self.wire, self.chain, self.seen = wire, chain, []
 
     def wait_until(self, time_s):
-        self.clock.wait_until(time_s)
-        self.chain.time_is(self.clock.now_s())
-        self.seen.append((self.clock.now_s(), self.chain.state(1)["position"]))
+        super().wait_until(time_s)
+        self.chain.time_is(self.now_s())
+        self.seen.append((self.now_s(), self.chain.state(1)["position"]))
 
     def fastest_deg_s(self, table):
         steps = zip(self.seen, self.seen[1:], strict=False)
@@ -47,7 +45,7 @@ def test_it_gets_there_slowly_and_torque_and_profile_are_put_back(model, by):
         table = seen.registers()
         speed, torque = table.role("moving_speed"), seen.named("torque_enable")
         before = seen.read(speed)
-        wire.clock = watched = Watched(wire, chain)
+        wire.port = watched = Watched(wire, chain)
         result = move(seen, None, str(by))
         assert abs(result["reached"] - (table.center_ticks + by)) <= table.ticks_per_revolution / 200
         assert (seen.read(torque), seen.read(speed)) == (0, before)
@@ -100,7 +98,7 @@ def test_one_outside_its_own_limits_is_brought_in_slowly_and_moved_on(model, cap
         assert not chain.state(1)["torque"] and chain.state(1)["position"] == servo.start_ticks
         speed, torque = table.role("moving_speed"), seen.named("torque_enable")
         before = seen.read(speed)
-        wire.clock = watched = Watched(wire, chain)
+        wire.port = watched = Watched(wire, chain)
         result = move(seen, str(table.center_ticks), None)
         assert abs(result["reached"] - table.center_ticks) <= table.ticks_per_revolution / 200
         assert (seen.read(torque), seen.read(speed)) == (0, before)
@@ -124,12 +122,12 @@ def test_one_that_does_not_come_in_has_no_torque_before_its_usual_profile_is_bac
 
     with wire_on(servo, family=MODELS[model]) as (wire, chain):
         seen = wire.find(1)
-        speed, clock = table.role("moving_speed"), wire.clock
+        speed, port = table.role("moving_speed"), wire.port
         before = seen.read(speed)
-        wire.clock = Ended(wire, chain)
+        wire.port = Ended(wire, chain)
         with pytest.raises((ServoError, KeyboardInterrupt)):
             move(seen, str(table.center_ticks), None)
-        wire.clock = clock
+        wire.port = port
         assert seen.read(speed) == before and not chain.state(1)["torque"] and chain.state(1)["position"] < first
 
 
@@ -141,7 +139,7 @@ def test_something_in_the_way_ends_it_without_torque():
                 super().wait_until(time_s)
                 self.chain.turn(1, 2048)  # a hand that keeps the shaft where it is
 
-        wire.clock = Blocked(wire, chain)
+        wire.port = Blocked(wire, chain)
         with pytest.raises(ServoError, match="something is in the way"):
             move(wire.find(1), None, "60deg")
         assert not chain.state(1)["torque"] and abs(chain.state(1)["position"] - 2048) < BEHIND_DEG * 4096 / 360
@@ -187,7 +185,7 @@ def cable_out(wire, chain):
 def test_after_an_interrupt_torque_is_off_or_named(more, ends):
     with wire_on(new(1, "ax-12a"), family="dynamixel1") as (wire, chain):
         seen = wire.find(1)
-        wire.clock = Interrupted(wire, chain, more)
+        wire.port = Interrupted(wire, chain, more)
         with pytest.raises(ends) as ended:
             move(seen, None, "200")
         assert chain.state(1)["torque"] == (ends is TorqueError)
@@ -272,7 +270,7 @@ def test_nothing_but_torque_is_written_whatever_model_the_head_names(model, name
             put(wire, servo, "torque_enable", 1)
         if model == "xl330-m288":  # a host that died: its watchdog trips and refuses goals
             put(wire, 1, "bus_watchdog", 5)
-            wire.clock.wait_until(wire.clock.now_s() + 1.0)
+            wire.port.wait_until(wire.port.now_s() + 1.0)
         live = ("present", "moving", "realtime", "torque_enable", "velocity_trajectory", "position_trajectory")
 
         def settings(servo):

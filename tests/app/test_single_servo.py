@@ -36,7 +36,7 @@ def wire_on(
         clock = VirtualClock()
         port = VirtualTimePort(chain.device, chain.control, baud or 1_000_000, clock)
         try:
-            yield Wire(port, family, clock, baud or 1_000_000, fixed=baud is not None), chain
+            yield Wire(port, family, baud or 1_000_000, fixed=baud is not None), chain
         finally:
             port.close()
 
@@ -84,7 +84,7 @@ def test_a_model_without_a_number_is_read_when_somebody_says_what_it_is():
     with wire_on(EmulatedServo(1, "sts3032"), family="feetech") as (wire, _):
         with pytest.raises(ConfigError, match=r"no firmware map.*sts3032.*--model"):
             single.read_registers(wire.find(1), ["voltage"])
-        told = Wire(wire.port, "feetech", wire.clock, wire.baud, model="sts3032")
+        told = Wire(wire.port, "feetech", wire.baud, model="sts3032")
         assert single.read_registers(told.find(1), ["voltage"])[0]["raw"] > 0
 
 
@@ -306,7 +306,7 @@ def test_rates_that_the_adapter_cannot_do_are_passed_over_and_never_set():
     with launch(THREE, virtual=True) as chain:
         clock = VirtualClock()
         port = Choosy(chain.device, chain.control, 1_000_000, clock)
-        wire = Wire(port, "dynamixel2", clock, 1_000_000)
+        wire = Wire(port, "dynamixel2", 1_000_000)
         assert len(single.scan(wire)) == 3
         with pytest.raises(PortError, match="cannot do 4000000"):
             set_baud(wire.find(1), 4_000_000, yes)
@@ -374,10 +374,10 @@ ASKED = ("dynamixel2", "dynamixel1", "feetech")
 def test_servos_of_another_protocol_are_named(model, baud, asked):
     servo = EmulatedServo(1, model, baud, load_firmware_map(model).center_ticks)
     with wire_on(servo, family=asked) as (wire, chain):
-        before, began_s = wire.baud, wire.clock.now_s()
+        before, began_s = wire.baud, wire.port.now_s()
         hint, spoken = protocol_hint(other_wires(wire)), SPOKEN[model]
         assert ("" if spoken == asked else f"--family {spoken}") in hint and bool(hint) == (spoken != asked)
-        assert wire.baud == before and wire.clock.now_s() - began_s < 3.0
+        assert wire.baud == before and wire.port.now_s() - began_s < 3.0
         chain.kill(1)
         assert protocol_hint(other_wires(wire)) == ""  # an empty wire
 

@@ -45,7 +45,7 @@ CASES = [
     (FAST + " --record-format ros2", 2, ["--record-format ros2: nothing is recorded (--record DIR)"]),
     (FAST + " --face ros2:a.b", 2, ["--face ros2: expected a topic such as /audio"]),
     ("run --face {tmp}/face.csv", 2, ["face.csv", "jawOpen"]),
-    ("run --addressed perhaps", 2, ["--addressed perhaps", "sense, assume, never"]),
+    ("run --addressed perhaps", 2, ["--addressed: addressed = 'perhaps'", "'sense', 'assume' or 'never'"]),
     ("run --calmness addressed=1", 2, ["--calmness addressed", "nod, shake"]),
     ("run --fast --audio none", 2, ["never ends"]),
     (FAST + " --port {device}", 2, ["emulated servos"]),

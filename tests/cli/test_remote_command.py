@@ -10,10 +10,11 @@ import pytest
 from ended import PROGRAM
 
 from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, open_fleet
+from sfms_robot.app.listen.knobs import RunControls
+from sfms_robot.app.options import RunOptions
+from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.network import Router, close_session, serve_session, session_config
-from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.safety import Interrupt
 
 ALONE = {"scouting": {"multicast": {"enabled": False}}}
 
@@ -33,9 +34,9 @@ def test_a_page_prints_its_address_as_json_and_serves_until_a_signal_ends_it(rou
 
 def test_resume_and_end_are_refused_without_the_fleets_key_and_halt_is_not(router, tmp_path, command_line, caplog):
     mine, other = tmp_path / "mine.key", tmp_path / "other.key"
-    latch, interrupt = HaltLatch(), Interrupt()
-    controls = FleetControls(latch, interrupt, None, None, "hall", fleet_key(mine))
-    head = FleetHead("hall", lambda: {"state": "halted"}, controls, router)
+    run = RunControls(load_head("face28"), RunOptions())
+    latch, interrupt, run.document = run.halt, run.interrupt, lambda: {"state": "halted"}
+    head = FleetHead(FleetControls(run, "hall", fleet_key(mine)), router)
     with closing(head), open_fleet(router.file) as fleet:
         while not fleet.states():
             pass  # until it is connected

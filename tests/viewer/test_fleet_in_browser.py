@@ -6,8 +6,9 @@ import pytest
 from chromium import Page, missing
 
 from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, fleet_page, open_fleet
-from sfms_robot.runtime.halt import HaltLatch
-from sfms_robot.runtime.safety import Interrupt
+from sfms_robot.app.listen.knobs import RunControls
+from sfms_robot.app.options import RunOptions
+from sfms_robot.config import load_head
 
 pytest.importorskip("zenoh", reason="needs the extra [remote]")
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(bool(missing()), reason=f"needs {missing()}"), pytest.mark.realtime]
@@ -20,9 +21,9 @@ class Head:
     """A run as a fleet knows it: what it tells, and what may be done to it."""
 
     def __init__(self, name, router):
-        self.halt = HaltLatch()
-        controls = FleetControls(self.halt, Interrupt(), None, None, name, fleet_key(None))
-        self.head = FleetHead(name, self.document, controls, router)
+        run = RunControls(load_head("face28"), RunOptions())
+        self.halt, run.document = run.halt, self.document
+        self.head = FleetHead(FleetControls(run, name, fleet_key(None)), router)
 
     def document(self):
         by = self.halt.by

@@ -89,8 +89,7 @@ class ListenerStream:
         if face is not None:
             motion = _checked("face", face.motion if isinstance(face, FaceFrame) else face)
             seen = FaceFrame(time_s, motion[:6], motion[6:], getattr(face, "jaw_rad", None))
-        frame = SpeakerFrame(time_s, heard, seen, said)
-        plan, self._memory = self._listener.step(frame, self._memory)
+        plan, self._memory = self._listener.step(SpeakerFrame(time_s, heard, seen, said), self._memory)
         self._frames += 1
         return plan
 

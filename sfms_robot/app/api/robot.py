@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Final, Self
 
 from sfms_robot.app.api.servos import Background, Driven, head_name
-from sfms_robot.app.listen.knobs import LiveKnobs
-from sfms_robot.app.listen.report import Report
+from sfms_robot.app.listen.knobs import LiveKnobs, RunControls
 from sfms_robot.app.open_head import prepare_head
-from sfms_robot.app.options import SIM, RunOptions, record_format_named
-from sfms_robot.app.session import RunControls, run
+from sfms_robot.app.options import SIM, Report, RunOptions, record_format_named, words_of
+from sfms_robot.app.session import run
 from sfms_robot.config import Calmness, Head, parse
 from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
@@ -116,8 +115,8 @@ class Robot(Driven):
             duration_s=duration_s,
             seed=seed,
             engine=engine,
-            intensity=_turned(intensity),
-            style=_turned(style),
+            intensity=words_of(intensity or {}),
+            style=words_of(style or {}),
             calmness=parse(Calmness, {**(calmness or {}), "addressed": addressed}, "calmness"),
             record=None if record is None else Path(record),
             record_format=record_format_named(record_format),
@@ -277,22 +276,22 @@ class Robot(Driven):
 
     def report(self) -> Report:
         """Return the report of `run --json`; during the run its known keys, with "exit": "running"."""
-        if self._run is not None and self._run.report is not None:
-            return {**self._run.report, "callbacks_detached": dict(self._events.detached)}
-        options, now = self._options, self._controls.document()
-        return {
-            "version": 1,
-            "head": Path(options.head).name,
-            "listener": Path(options.listener).name,
-            "port": options.port,
-            "seed": options.seed,
-            "exit": "running",
-            "torque_unconfirmed": [],
-            "duration_s": now.get("time_s", 0.0),
-            "frames": now.get("frames", 0),
-            "ticks": now.get("ticks", 0),
-            "callbacks_detached": dict(self._events.detached),
-        }
+        report = self._run.report if self._run is not None else None
+        if report is None:
+            options, now = self._options, self._controls.document()
+            report = {
+                "version": 1,
+                "head": Path(options.head).name,
+                "listener": options.listener_name,
+                "port": options.port,
+                "seed": options.seed,
+                "exit": "running",
+                "torque_unconfirmed": [],
+                "duration_s": now.get("time_s", 0.0),
+                "frames": now.get("frames", 0),
+                "ticks": now.get("ticks", 0),
+            }
+        return {**report, "callbacks_detached": dict(self._events.detached)}
 
     def _drive(self, now: Background) -> Report:
         options, source = self._options, self._source
@@ -305,9 +304,6 @@ class Robot(Driven):
                 own = self._speech if options.play is None else open_playback(options.play, self._speech)
                 source = PairedSource(*self._person, own)
                 stack.callback(source.close)
-            watchers = [now, self._events]
-            return run(options, source=source, feed=feed, observers=watchers, controls=self._controls, signals=False)
-
-
-def _turned(regions: Mapping[str, float] | None) -> tuple[str, ...]:
-    return tuple(f"{region}={value}" for region, value in (regions or {}).items())
+            return run(
+                options, source=source, feed=feed, observers=[now, self._events], controls=self._controls, signals=False
+            )

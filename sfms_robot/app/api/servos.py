@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.listen.report import Report, failure
+from sfms_robot.app.listen.report import failure
 from sfms_robot.app.open_head import open_head
-from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.options import SIM, HeadOptions, Report
 from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.config import Head, load_head
 from sfms_robot.errors import BusError, ConfigError, InputError, RobotError
 from sfms_robot.frames import POSE, Doubles, Floats, Reading
+from sfms_robot.motion.limits import JointLimits
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
@@ -226,11 +227,9 @@ class Servos(Driven):
     def __enter__(self) -> Self:
         """Connect. Blocks while the servos are identified; torque stays as found. Raises RobotError."""
         self._opened = self._stack.enter_context(open_head(self._options))
-        joints = self._opened.config.joints
-        self.joints = tuple(joints)
-        self.low_rad = np.array([joint.min_rad for joint in joints.values()])
-        self.high_rad = np.array([joint.max_rad for joint in joints.values()])
-        self.rest_rad = self._opened.motion.rest_rad
+        head, limits = self._opened.config, JointLimits.of(self._opened.config)
+        self.joints = tuple(head.joints)
+        self.low_rad, self.high_rad, self.rest_rad = limits.low, limits.high, head.rest_rad
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:

@@ -11,12 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
+from pydantic import BaseModel
 
 from sfms_robot.app.open_head import build_bus, build_motion, doctor_command, fastest_hz, identify
 from sfms_robot.app.options import SIM
@@ -62,9 +63,8 @@ class AgainError(RobotError):
     """This joint is to be measured again; the text says why."""
 
 
-@dataclass(kw_only=True)
-class CalibrationOutcome:
-    """The result of a calibration.
+class CalibrationOutcome(BaseModel):
+    """The result of a calibration, and with `model_dump(mode="json")` its report.
 
     Attributes:
         measured, before: joints measured now, and earlier.
@@ -74,18 +74,16 @@ class CalibrationOutcome:
         torque_unconfirmed: joints whose torque came on and could not be confirmed off.
     """
 
+    version: Literal[1] = 1
     head: str
     file: Path
     exit: Literal["done", "interrupted"] = "done"
-    measured: list[str] = field(default_factory=list)
-    before: list[str] = field(default_factory=list)
-    skipped: dict[str, str] = field(default_factory=dict)
-    missing: list[str] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-    torque_unconfirmed: list[str] = field(default_factory=list)
-
-    def as_dict(self) -> dict[str, Any]:
-        return {"version": 1, **vars(self), "file": str(self.file)}
+    measured: list[str] = []
+    before: list[str] = []
+    skipped: dict[str, str] = {}
+    missing: list[str] = []
+    problems: list[str] = []
+    torque_unconfirmed: list[str] = []
 
 
 def calibrate(
@@ -147,8 +145,8 @@ def calibrate_on(
                 outcome.skipped[joint] = str(reason)
                 say(f"  left out: {reason}")
                 continue
-            layer = CalibrateLayer(head_sha256=sha256, joints={**overlay.measured, joint: found})
-            overlay = overlay.replaced(calibrate=layer)
+            measured = {**overlay.measured, joint: found}
+            overlay = overlay.replaced(calibrate=CalibrateLayer(head_sha256=sha256, joints=measured))
             if overlay.stored is not None:
                 overlay = overlay.recorded(sha256, joint, found.stored)
             save_overlay(overlay, file)
@@ -206,8 +204,7 @@ class Guide:
         if not min(low, high) <= rest <= max(low, high):
             raise AgainError(f"its rest, {rest} ticks, is not between its ends, {low} and {high}")
         sign: Literal[1, -1] = 1 if high > low else -1
-        in_file = joint.max_deg - joint.min_deg
-        self.say(f"  {low}..{rest}..{high} ticks, {travel_deg:.1f} deg (its file: {in_file:.1f})")
+        self.say(f"  {low}..{rest}..{high} ticks, {travel_deg:.1f} deg (its file: {joint.max_deg - joint.min_deg:.1f})")
         if sign != joint.sign:
             turns = "fall" if sign < 0 else "rise"
             said = f"  Ticks {turns} towards the upper end, other than its file says. Is that so? Enter: yes, n: no > "

@@ -17,8 +17,8 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.app.head.pose import FaceTrack
-from sfms_robot.app.listen.report import Report, failure
-from sfms_robot.app.options import SIM, HeadOptions
+from sfms_robot.app.listen.report import failure
+from sfms_robot.app.options import SIM, HeadOptions, Report
 from sfms_robot.app.replay.run_file import RunRecording, read_recording
 from sfms_robot.app.session import Panel
 from sfms_robot.config import Head, load_head
@@ -131,17 +131,24 @@ def fit_head(name: str, recording: Path) -> Report:
     layered(shipped, changed := overlay.replaced(fit=layer), sha256)  # refuses what is not sound
     save_overlay(changed, file)
     both = {key: rms(np.array([row[key] for row in measured])) for key in ("before", "after")}
-    facts = {"head": head.name, "frames": len(has), "delay_s": delay_s, **both, "joints": rows}
-    return {**facts, "file": str(file), "practice": practice}
+    return {
+        "head": head.name,
+        "frames": len(has),
+        "delay_s": delay_s,
+        **both,
+        "joints": rows,
+        "file": str(file),
+        "practice": practice,
+    }
 
 
 def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks: Doubles) -> list[Report]:
     rows: list[Report] = []
-    for j, (joint, response) in enumerate(zip(head.joints, responses, strict=True)):
+    for joint, response, value, look in zip(head.joints, responses, has.T, looks.T, strict=True):
         row: Report = {"joint": joint, "moved": None, "before": None, "after": None}
         if response is not None:
-            seen = looks[:, j] - response.offset
-            row |= {"moved": response.moved, "before": rms(seen - has[:, j]), "after": rms(seen - response(has[:, j]))}
+            seen = look - response.offset
+            row |= {"moved": response.moved, "before": rms(seen - value), "after": rms(seen - response(value))}
         rows.append(row)
     return rows
 
@@ -152,8 +159,9 @@ def read_pairs(head: Head, folder: Path, run: RunRecording) -> tuple[Doubles, Fl
     `run`: the recording of `folder`. Raises ConfigError.
     """
     if missing := [joint for joint in head.joints if joint not in run.joints]:
-        recorded = run.about.get("head", "?")
-        raise ConfigError(f"{folder}: is of head {recorded!r}, without joint {missing[0]!r} of {head.name!r}")
+        raise ConfigError(
+            f"{folder}: is of head {run.about.get('head', '?')!r}, without joint {missing[0]!r} of {head.name!r}"
+        )
     found = [folder / name for name in FACE_FILES if (folder / name).is_file()]
     if not found:
         raise ConfigError(f"{folder}: has no {FACE_FILES[0]}: the track of the robot's own face, on the run's clock")

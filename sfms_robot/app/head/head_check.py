@@ -22,8 +22,9 @@ from scipy.interpolate import CubicSpline
 
 from sfms_robot.app.head.fit import Tracker, skin_motion
 from sfms_robot.app.head.head_scene import scene_of
-from sfms_robot.app.listen.report import Report, limitation
+from sfms_robot.app.listen.report import limitation
 from sfms_robot.app.open_head import check_safety
+from sfms_robot.app.options import Report
 from sfms_robot.app.output_paths import INK, new_figure, plain, save
 from sfms_robot.app.progress import tracked
 from sfms_robot.config import Head, load_head
@@ -127,14 +128,20 @@ def _angles(retargeter: HeadRetargeter, clip: Floats) -> Doubles:
 
 def _rows(head: Head, retargeter: HeadRetargeter, clips: Sequence[Doubles]) -> list[Report]:
     limits = JointLimits.of(head)
-    rest = np.array([joint.rest_rad for joint in head.joints.values()])
+    rest = head.rest_rad
     every = np.concatenate(clips)
     low, high = every.min(axis=0), every.max(axis=0)
     at_end = ((every <= limits.low + _AT_END_RAD) & (rest > limits.low)) | (
         (every >= limits.high - _AT_END_RAD) & (rest < limits.high)
     )
-    speed = _largest(clips, 1) / limits.speed
-    jerk = _largest(clips, 3) / limits.jerk
+    figures = {
+        "used": (high - low) / (limits.high - limits.low),
+        "low_deg": np.degrees(low),
+        "high_deg": np.degrees(high),
+        "clipped": at_end.mean(axis=0),
+        "speed": _largest(clips, 1) / limits.speed,
+        "jerk": _largest(clips, 3) / limits.jerk,
+    }
     channels = _channels(head, retargeter)
     return [
         {
@@ -142,12 +149,7 @@ def _rows(head: Head, retargeter: HeadRetargeter, clips: Sequence[Doubles]) -> l
             "servo": joint.model,
             **{key: getattr(joint, key) for key in ("bus", "id", "min_deg", "rest_deg", "max_deg")},
             "channels": channels[name],
-            "used": float((high[j] - low[j]) / (limits.high[j] - limits.low[j])),
-            "low_deg": float(np.degrees(low[j])),
-            "high_deg": float(np.degrees(high[j])),
-            "clipped": float(at_end[:, j].mean()),
-            "speed": float(speed[j]),
-            "jerk": float(jerk[j]),
+            **{key: float(column[j]) for key, column in figures.items()},
         }
         for j, (name, joint) in enumerate(head.joints.items())
     ]
@@ -162,26 +164,11 @@ def _largest(clips: Sequence[Doubles], order: int) -> Doubles:
 def _channels(head: Head, retargeter: HeadRetargeter) -> dict[str, Sequence[str]]:
     trees = drives(head)
     found: dict[str, Sequence[str]] = {name: sorted(tree.channels()) if tree else () for name, tree in trees.items()}
-    if retargeter.neck is not None:
-        for name in retargeter.neck.joints:
-            found[name] = _axes_of(head, retargeter.neck, name)
+    neck, kinematics = retargeter.neck, head.kinematics
+    if neck is not None and kinematics is not None:
+        for name in neck.joints:
+            found[name] = [axis for axis in neck.axes if name in kinematics.joints_of(axis)]
     return found
-
-
-def _axes_of(head: Head, neck: Neck, joint: str) -> Sequence[str]:
-    """Return the axes of a serial neck that a joint takes part in; of a platform, all, and yaw for the body."""
-    kinematics = head.kinematics
-    if kinematics is None or kinematics.kind == "stewart":
-        body = kinematics is not None and kinematics.body_yaw is not None and kinematics.body_yaw.joint == joint
-        return ("yaw",) if body else tuple(neck.axes)
-    pair = kinematics.differential
-    if pair is not None and joint in (pair.left, pair.right):
-        return ("pitch", "roll")
-    return tuple(
-        axis
-        for axis, place in kinematics.axes.items()
-        if place == joint or (not isinstance(place, str) and joint in (place.lower, place.upper))
-    )
 
 
 def _neck(neck: Neck, clips: Sequence[Floats]) -> Report:
@@ -264,10 +251,16 @@ def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> Report:
             )
         sums["all"] = np.sum(list(sums.values()), axis=0)
         for face, total in sums.items():
-            seconds, *shares = total.tolist()
-            expression, pose = _share(*shares[:2]), _share(*shares[2:])
-            row = {"head": head.name, "face": face, "seconds": round(seconds, 1)}
-            rows.append({**row, "expression": expression, "pose": pose})
+            seconds, lost, wanted, pose_lost, pose_wanted = total.tolist()
+            rows.append(
+                {
+                    "head": head.name,
+                    "face": face,
+                    "seconds": round(seconds, 1),
+                    "expression": _share(lost, wanted),
+                    "pose": _share(pose_lost, pose_wanted),
+                }
+            )
     return {"version": 1, "rows": rows}
 
 

@@ -19,9 +19,8 @@ import yaml
 from pydantic import BaseModel, RootModel
 
 from sfms_robot.app.output_paths import made_folder
-from sfms_robot.config.base import parse, read
-from sfms_robot.config.firmware import FirmwareMap, load_firmware_map, map_files
-from sfms_robot.config.head import Head
+from sfms_robot.config import FirmwareMap, Head, load_firmware_map, map_files, parse
+from sfms_robot.config.base import read
 from sfms_robot.data import head_file
 from sfms_robot.errors import ConfigError
 

@@ -42,8 +42,12 @@ def solve_poses(head_name: str, file: Path) -> dict[str, Any]:
     solved = neck.solve(poses, body_yaw_rad)
     keys = ("angles_rad", "reached", "residual_rad", "residual_m")
     rows = zip(*(getattr(solved, key).tolist() for key in keys), strict=True)
-    found = [dict(zip(keys, row, strict=True)) for row in rows]
-    return {"version": 1, "head": head.name, "joints": list(neck.joints), "poses": found}
+    return {
+        "version": 1,
+        "head": head.name,
+        "joints": list(neck.joints),
+        "poses": [dict(zip(keys, row, strict=True)) for row in rows],
+    }
 
 
 def read_poses(file: Path) -> tuple[Doubles, Doubles | None]:

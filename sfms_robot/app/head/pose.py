@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from sfms_robot.app.listen.report import OUTCOME, Report, failure
-from sfms_robot.app.options import HeadOptions, RunOptions
+from sfms_robot.app.listen.report import OUTCOME, failure
+from sfms_robot.app.options import HeadOptions, Report, RunOptions
 from sfms_robot.app.session import Panel, run
 from sfms_robot.config import Head, load_head
+from sfms_robot.config.base import read
+from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, TorqueError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Facts, Observer, Source, Tick
@@ -32,29 +35,18 @@ _TURN: Final = 360.0
 _BOUNDS: Final = {"roll": 1.0, "pitch": 1.0, "yaw": 1.6, "x": 0.1, "y": 0.1, "z": 0.1}  # rad and m, either way
 
 
-def _both(**values: float) -> dict[str, float]:
-    """Return the values of pairs of channels, left and right."""
-    return {f"{name}{side}": value for name, value in values.items() for side in ("Left", "Right")}
+@cache
+def expressions() -> Mapping[str, Mapping[str, float]]:
+    """Return the channels of the faces of configs/expressions.yaml, by name. Raises ConfigError."""
+    faces = read(data_dir("configs") / "expressions.yaml")
+    return {
+        face: {f"{name}{side}": value for name, value in given.items() for side in _sides(name)}
+        for face, given in faces.items()
+    }
 
 
-# Faces by name, for words of `head pose` and buttons of the page; the page leaves all other channels to the listener.
-EXPRESSIONS: Final[Mapping[str, Mapping[str, float]]] = {
-    "smile": _both(mouthSmile=0.9, cheekSquint=0.4, eyeSquint=0.2),
-    "laugh": {**_both(mouthSmile=1.0, cheekSquint=0.8, eyeSquint=0.5), "jawOpen": 0.35, "pitch": -0.08},
-    "surprise": {**_both(browOuterUp=0.8, eyeWide=0.8), "browInnerUp": 0.9, "jawOpen": 0.4},
-    "doubt": {"browDownLeft": 0.6, "browOuterUpRight": 0.8, "mouthLeft": 0.4, "roll": 0.12},
-    "frown": _both(mouthFrown=0.8, browDown=0.6),
-    "sad": {**_both(mouthFrown=0.8), "browInnerUp": 0.8, "mouthShrugLower": 0.4, "pitch": 0.15},
-    "anger": _both(browDown=1.0, noseSneer=0.6, mouthPress=0.5),
-    "disgust": _both(noseSneer=0.9, mouthUpperUp=0.6, browDown=0.5, eyeSquint=0.4),
-    "kiss": {"mouthPucker": 1.0, "mouthFunnel": 0.2},
-    "wink": {"eyeBlinkLeft": 1.0, "cheekSquintLeft": 0.6, "mouthSmileLeft": 0.5},
-    "blink": _both(eyeBlink=1.0),
-    "eyes closed": _both(eyeBlink=1.0),
-    "nod": {"pitch": 0.2},
-    "look_left": {"eyeLookOutLeft": 0.7, "eyeLookInRight": 0.7, "yaw": 0.3},
-    "look_right": {"eyeLookInLeft": 0.7, "eyeLookOutRight": 0.7, "yaw": -0.3},
-}
+def _sides(name: str) -> Sequence[str]:
+    return ("",) if name in CHANNEL_INDEX else ("Left", "Right")
 
 
 def parse_face(words: Sequence[str]) -> Floats:
@@ -63,10 +55,10 @@ def parse_face(words: Sequence[str]) -> Floats:
     for word in words:
         name, equals, text = word.partition("=")
         if not equals:
-            if name not in EXPRESSIONS:
-                choices = [*EXPRESSIONS, "CHANNEL=VALUE"]
+            if name not in expressions():
+                choices = [*expressions(), "CHANNEL=VALUE"]
                 raise ConfigError.at("head pose", "EXPRESSION", word, "is not an expression", choices)
-            for channel, value in EXPRESSIONS[name].items():
+            for channel, value in expressions()[name].items():
                 motion[CHANNEL_INDEX[channel]] = value
             continue
         if name not in CHANNEL_INDEX:
@@ -88,7 +80,7 @@ def parse_face(words: Sequence[str]) -> Floats:
     return motion
 
 
-def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float = 2.0, panel: Panel | None = None) -> Report:
+def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float, panel: Panel | None = None) -> Report:
     """Rise to the face of `words`, hold it, return to rest. Report how far each joint went, and unconfirmed torque.
 
     Blocks until then. Raises any other RobotError, the head at rest.
@@ -185,7 +177,7 @@ class Furthest(Observer):
 
     def __init__(self, head: Head) -> None:
         self._joints = tuple(head.joints)
-        self._rest_rad = np.array([joint.rest_rad for joint in head.joints.values()])
+        self._rest_rad = head.rest_rad
         self._sent, self._reached = np.zeros(len(self._joints)), np.full(len(self._joints), np.nan)
 
     def tick(self, seen: Tick) -> None:

@@ -13,8 +13,7 @@ import numpy as np
 
 from sfms_robot.app import session
 from sfms_robot.app.listen.page_session import page_session
-from sfms_robot.app.listen.report import Report
-from sfms_robot.app.options import RunOptions, open_browser
+from sfms_robot.app.options import Report, RunOptions, open_browser
 from sfms_robot.config import load_head
 from sfms_robot.data import speaker_names
 from sfms_robot.errors import MissingExtra
@@ -23,12 +22,13 @@ from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import PageProcess
 
 FOLDER: Final = Path("runs", "demo")
+FACE: Final = "none"  # of the person, who is there by voice alone, which is what a microphone gives
 PLOT, SHEET = "run.png", "head.png"
 _KEPT: Final = ("version", "exit", "exit_code", "error", "head", "listener", "seed", "duration_s")
 
 
 def demo(
-    options: RunOptions, folder: Path | None = None, panel: session.Panel | None = None, page: PageProcess | None = None
+    options: RunOptions, folder: Path | None, panel: session.Panel | None = None, page: PageProcess | None = None
 ) -> Report:
     """Run once, record it, show it on a page or draw it. Raises RobotError.
 
@@ -37,7 +37,7 @@ def demo(
     is left out and `"missing"` names the pip install. `folder` None: a new one, `FOLDER` or the next free number.
     """
     folder = folder if folder is not None else free_folder(FOLDER)
-    options = replace(_with_voice(options), record=folder)
+    options = replace(options, audio=DEFAULT_SPEAKER, face=FACE, record=folder)
     seen = False
     if page is None:
         report = session.run(options, panel)
@@ -79,16 +79,11 @@ def next_speaker(speaker: str) -> str:
     return names[(names.index(speaker) + 1) % len(names) if speaker in names else 0]
 
 
-def _with_voice(options: RunOptions) -> RunOptions:
-    """Add the bundled person, by voice alone, which is what a microphone gives."""
-    return replace(options, audio=DEFAULT_SPEAKER, face="none")
-
-
 def compare_seeds(options: RunOptions, seeds: int, each: Callable[[Report], None]) -> Report:
     """Run seeds 0 to `seeds` - 1 one after the other, without recording; call `each` with each. Raises RobotError."""
     rows = []
     for seed in range(seeds):
-        seeded = replace(_with_voice(options), seed=seed)
+        seeded = replace(options, audio=DEFAULT_SPEAKER, face=FACE, seed=seed)
         rows.append(_summary(seeded, session.run(seeded)))
         each(rows[-1])
         if rows[-1]["exit"] != "done":

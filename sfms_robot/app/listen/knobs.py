@@ -1,20 +1,28 @@
-"""The scale of each region of a head, set while it runs; `--intensity`, `--style` and `--calmness` of a run."""
+"""Commands on a run from any thread: the scale of each region of its head, rates of events, faces, halt and end."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from threading import RLock
-from typing import Final, get_args
+from typing import TYPE_CHECKING, Final
 
+from sfms_robot.app.options import RunOptions, values_by_name
 from sfms_robot.config import Calmness, Head, parse
-from sfms_robot.errors import ConfigError, InputError
-from sfms_robot.frames import EVENT_KINDS
+from sfms_robot.errors import InputError
+from sfms_robot.ports import Facts
 from sfms_robot.retarget.channel_mapping import ChannelMapping as Face
 from sfms_robot.retarget.channel_mapping import Knobs
+from sfms_robot.retarget.head_retargeter import HeadRetargeter
+from sfms_robot.retarget.puppet import Puppet
+from sfms_robot.runtime.halt import HaltLatch
+from sfms_robot.runtime.safety import Interrupt
+
+if TYPE_CHECKING:
+    from sfms_robot.sources.net_person import PageVisitor
+    from sfms_robot.sources.push import Spoken
 
 STEP: Final = 0.1  # of a key
 MOST: Final = 2.0
-ADDRESSED: Final[tuple[str, ...]] = get_args(Calmness.model_fields["addressed"].annotation)
 
 
 class Knob:
@@ -102,25 +110,43 @@ def turned(head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ())
 
     Raises ConfigError for an unknown region or a value outside 0..2.
     """
-    return LiveKnobs(head, _values("--intensity", intensity), _values("--style", style))
+    return LiveKnobs(head, values_by_name("--intensity", intensity), values_by_name("--style", style))
 
 
-def calmed(per_minute: Sequence[str] = (), addressed: str = "sense") -> Calmness:
-    """Return the rates of `--calmness` and `--addressed`. Raises ConfigError for an unknown kind or an invalid rate."""
-    rates = _values("--calmness", per_minute, "KIND=EVENTS A MINUTE")
-    if unknown := [kind for kind in rates if kind not in EVENT_KINDS]:
-        raise ConfigError(f"--calmness {unknown[0]}: no kind of event ({', '.join(EVENT_KINDS)})")
-    if addressed not in ADDRESSED:
-        raise ConfigError(f"--addressed {addressed}: none of {', '.join(ADDRESSED)}")
-    return parse(Calmness, {**rates, "addressed": addressed}, "--calmness")
+# --- all that other threads may do to a run ---------------------------------------------------------------------------
 
 
-def _values(option: str, given: Sequence[str], form: str = "REGION=VALUE with a value from 0 to 2") -> dict[str, float]:
-    values = {}
-    for text in given:
-        region, _, value = text.partition("=")
-        try:
-            values[region] = float(value)
-        except ValueError:
-            raise ConfigError(f"{option} {text!r} is not {form}") from None
-    return values
+class RunControls:
+    """Commands on a run from any thread: a page, a fleet, keys, a program. Motion stays under the head's limits.
+
+    Attributes:
+        interrupt: ends the run.
+        halt: emergency stop.
+        knobs: scale of each region.
+        puppet: faces over the listener's plan.
+        calmness: rates of events.
+        set_rates: of the listener; None: not begun, or in virtual time.
+        visitor: the person in front of a page. speech: what a program lets the robot say.
+        document: returns the status of the run; an empty one before it begins.
+    """
+
+    def __init__(self, head: Head, options: RunOptions) -> None:
+        self.interrupt, self.halt = Interrupt(), HaltLatch()
+        self.knobs = turned(head, options.intensity, options.style)
+        self.puppet = Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
+        self.calmness = options.calmness or Calmness()
+        self.set_rates: Callable[[Calmness], None] | None = None
+        self.document: Callable[[], Facts] = dict
+        self.visitor: PageVisitor | None = None
+        self.speech: Spoken | None = None
+
+    def calm(self, rates: Facts) -> None:
+        """Set rates of events per minute; the others stay. Raises ConfigError for an unknown kind or a bad rate."""
+        self.calmness = parse(Calmness, {**self.calmness.model_dump(), **rates}, "calm")
+        if self.set_rates is not None:
+            self.set_rates(self.calmness)
+
+    def release(self) -> None:
+        """Take torque off at once, as a second Ctrl-C does; the run ends with it."""
+        self.interrupt.ask()
+        self.interrupt.ask()

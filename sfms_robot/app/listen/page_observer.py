@@ -15,12 +15,11 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app.catalogue import shipped_listeners, shipped_speakers
-from sfms_robot.app.head.pose import EXPRESSIONS
+from sfms_robot.app.head.pose import expressions
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.listen.report import event_row
-from sfms_robot.app.options import RunOptions
-from sfms_robot.config import Calmness, Head
-from sfms_robot.config.listener import load_listener
+from sfms_robot.app.options import Report, RunOptions
+from sfms_robot.config import Calmness, Head, load_listener
 from sfms_robot.frames import CHANNELS, FRAME_HZ, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.events.model import load_tables
 from sfms_robot.plugins import listener_folder
@@ -47,7 +46,7 @@ def page_facts(
     *,
     feeds: Collection[str] = (),
     choices: bool = False,
-) -> dict[str, Any]:
+) -> Report:
     """Return the `hello` of docs/reference/protocol.md, but for the entries that differ between visitors.
 
     Args:
@@ -60,7 +59,7 @@ def page_facts(
         "version": VERSION,
         "head": head.name,
         "port": options.port,
-        "listener": Path(options.listener).name,
+        "listener": options.listener_name,
         "speaker": speaker,
         "seed": options.seed,
         "listeners": _lines(shipped_listeners()) if choices else [],
@@ -76,7 +75,7 @@ def page_facts(
         "urdf": None,
         "channels": list(CHANNELS),
         "regions": list(knobs),
-        "expressions": EXPRESSIONS,
+        "expressions": expressions(),
         **knobs.values,
         "calmness": calmness.model_dump(exclude={"addressed"}),
         "people_per_minute": {},
@@ -98,7 +97,7 @@ def people_per_minute(listener: str) -> dict[str, float]:
     return {kind: hazard.per_minute for kind, hazard in load_tables().hazards.items()}
 
 
-def _lines(rows: list[dict[str, Any]]) -> list[dict[str, str]]:
+def _lines(rows: list[Report]) -> list[dict[str, str]]:
     return [{"name": row["name"], "line": row["description"]} for row in rows]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -21,26 +21,26 @@ import numpy as np
 
 from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
-from sfms_robot.app.head.pose import EXPRESSIONS
+from sfms_robot.app.head.pose import expressions
+from sfms_robot.app.listen.knobs import RunControls
 from sfms_robot.app.listen.page_observer import PageObserver, PageRecorder, page_facts, people_per_minute
-from sfms_robot.app.listen.report import Report, run_facts
-from sfms_robot.app.options import RunOptions
+from sfms_robot.app.listen.report import run_facts
+from sfms_robot.app.options import FEEDS, Report, RunOptions, words_of
 from sfms_robot.config import load_head
 from sfms_robot.data import listener_names, speaker_names
 from sfms_robot.errors import NOTE, InputError
 from sfms_robot.frames import MOTION_DIM
 from sfms_robot.listeners.remote import NamedFeed
-from sfms_robot.ports import Observer, Tick
+from sfms_robot.ports import Facts, Observer, Tick
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.net_person import PageVisitor
-from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER, split_kind
+from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import PageProcess
 
 AWAY_S: Final = 5.0  # without visitors, after which the page is given up: one that is loaded again is back sooner
 LEFT_S: Final = 30.0
 PAUSE_S: Final = 3.0  # at rest, before the next recorded person talks
 BY_PAGE: Final = "page"  # a cause of a halt, and the door that clears it
-_FEEDS: Final = ("voice", "face")  # of a person
 _LOOK_S: Final = 0.5
 
 logger = logging.getLogger(__name__)
@@ -62,14 +62,14 @@ class PageSession:
 
     def __init__(self, page: PageProcess, options: RunOptions, folder: Path, choices: bool) -> None:
         self.page, self.options, self.released = page, options, False
-        self.reach: session.RunControls | None = None
+        self.reach: RunControls | None = None
         self.recorder: PageRecorder | None = None
         self._folder, self._choices = folder, choices
-        self._listeners = {Path(options.listener).name: options.listener, **{name: name for name in listener_names()}}
+        self._listeners = {options.listener_name: options.listener, **{name: name for name in listener_names()}}
         self._visitor = PageVisitor()
         self._wanted: RunOptions | None = None
         self._further = False  # the present run is not the first
-        self._set: dict[str, Any] = {}  # options that visitors turned in the run that went on last
+        self._set: Report = {}  # options that visitors turned in the run that went on last
         self._chosen = threading.Event()
         page.answered_by(self)
 
@@ -81,8 +81,8 @@ class PageSession:
         `feed`: a listener of these options that loads already.
         """
         options, head = self.options, load_head(self.options.head, servos=False)
-        joints, by_visitor = list(head.joints), _taken_of_visitors(options)
-        controls, watcher = session.RunControls(head, options), PageObserver(self.page, joints)
+        joints, by_visitor = list(head.joints), options.visitor_feeds
+        controls, watcher = RunControls(head, options), PageObserver(self.page, joints)
         self.released = False
         self._chosen.clear()
         watcher.document, controls.visitor = lambda: controls.document(), self._visitor
@@ -96,7 +96,7 @@ class PageSession:
                 options,
                 controls.knobs,
                 speaker if speaker in speaker_names() else None,
-                feeds=_FEEDS if self._choices else by_visitor,
+                feeds=FEEDS if self._choices else by_visitor,
                 choices=self._choices,
             )
             facts["people_per_minute"] = people_per_minute(options.listener)
@@ -138,26 +138,21 @@ class PageSession:
         """Take the run out of reach, and keep what visitors turned in it."""
         reach, self.reach = self.reach, None
         assert reach is not None
-        turned_to = {
-            kind: tuple(f"{name}={value}" for name, value in values.items())
-            for kind, values in reach.knobs.values.items()
-        }
-        self._set = {**turned_to, "calmness": reach.calmness}
+        self._set = {kind: words_of(values) for kind, values in reach.knobs.values.items()}
+        self._set["calmness"] = reach.calmness
 
     # --- from visitors; in the page's thread ---
 
-    def command(self, visitor: int, name: str, values: Mapping[str, Any]) -> None:
+    def command(self, visitor: int, name: str, values: Facts) -> None:
         """Carry out a command of a visitor. Raises RobotError."""
         if name in ("listener", "speaker", "seed"):
             self._choose(name, values["seed" if name == "seed" else "name"])
-        elif name == "source":
+            return
+        if name == "source":
             self._feeds(visitor, values["feeds"])
-        elif self.reach is None:
+            return
+        if (run := self.reach) is None:
             raise InputError(f"{name}: no run is on")
-        else:
-            self._do(self.reach, name, values)
-
-    def _do(self, run: session.RunControls, name: str, values: Mapping[str, Any]) -> None:
         match name:
             case "halt":
                 run.halt.close(BY_PAGE, BY_PAGE)
@@ -171,9 +166,9 @@ class PageSession:
             case "show":
                 run.puppet.show(values["channels"], values["seconds"])
             case "expression":
-                if values["name"] not in EXPRESSIONS:
-                    raise InputError(f"expression {values['name']!r} is not there ({', '.join(EXPRESSIONS)})")
-                run.puppet.show(EXPRESSIONS[values["name"]], values["seconds"])
+                if values["name"] not in expressions():
+                    raise InputError(f"expression {values['name']!r} is not there ({', '.join(expressions())})")
+                run.puppet.show(expressions()[values["name"]], values["seconds"])
             case "look_at":
                 run.puppet.look_at(**values)
             case "knobs":
@@ -198,7 +193,7 @@ class PageSession:
         offered = {"listener": list(self._listeners), "speaker": speaker_names()}.get(what)
         if offered is not None and value not in offered:
             raise InputError(f"{what} {value!r} is not there ({', '.join(offered)})")
-        changes: dict[str, dict[str, Any]] = {
+        changes: dict[str, Report] = {
             "listener": {"listener": self._listeners.get(value)},
             "speaker": {"audio": value, "face": "auto", "duration_s": None},
             "seed": {"seed": value},
@@ -206,15 +201,15 @@ class PageSession:
         self._want(changes[what])
 
     def _feeds(self, visitor: int, feeds: Sequence[str]) -> None:
-        taken = _taken_of_visitors(self._wanted or self.options)
-        if feeds and self._choices and len(taken) < len(_FEEDS):
+        taken = (self._wanted or self.options).visitor_feeds
+        if feeds and self._choices and len(taken) < len(FEEDS):
             self._want({"audio": BROWSER, "face": BROWSER, "duration_s": None})
         elif missing := [feed for feed in feeds if feed not in taken]:
-            flag = "--audio" if missing[0] == "voice" else "--face"
-            raise InputError(f"source: this run takes no {missing[0]} from a visitor ({flag} {BROWSER})")
+            flags = {"voice": "--audio", "face": "--face"}
+            raise InputError(f"source: this run takes no {missing[0]} from a visitor ({flags[missing[0]]} {BROWSER})")
         self._visitor.came(visitor, feeds)
 
-    def _want(self, changes: Mapping[str, Any]) -> None:
+    def _want(self, changes: Facts) -> None:
         """Ask for another run, with these options; the present one comes to rest."""
         self._wanted = replace(self._wanted or self.options, record=None, **changes)
         self._chosen.set()
@@ -260,10 +255,3 @@ def page_session(page: PageProcess, options: RunOptions, choices: bool = False) 
     logger.log(NOTE, "page: %s", page)
     with TemporaryDirectory(prefix="sfms-robot-", ignore_cleanup_errors=True) as folder:
         yield PageSession(page, options, Path(folder), choices)
-
-
-def _taken_of_visitors(options: RunOptions) -> list[str]:
-    """Return the feeds that a visitor brings."""
-    return [
-        feed for feed, kind in zip(_FEEDS, (options.hears, options.face), strict=True) if split_kind(kind)[0] == BROWSER
-    ]

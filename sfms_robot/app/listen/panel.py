@@ -17,18 +17,16 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from datetime import timedelta
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from sfms_robot.app.listen.knobs import STEP
+from sfms_robot.app.listen.knobs import STEP, RunControls
+from sfms_robot.ports import Facts
 from sfms_robot.runtime.halt import resume_here
-
-if TYPE_CHECKING:
-    from sfms_robot.app.session import RunControls
 
 try:
     import termios
@@ -213,7 +211,7 @@ def _suspending(screen: _Screen, found: Keyboard | None) -> Iterator[None]:
 # --- the lines of the panel -----------------------------------------------------------------------------------------
 
 
-def view(document: Mapping[str, Any], console: Console, keys: str, ending: bool = False) -> RenderableType:
+def view(document: Facts, console: Console, keys: str, ending: bool = False) -> RenderableType:
     """Return a status document as lines no wider than the terminal. `ending`: the run was interrupted."""
     rows = Table.grid(padding=(0, 1))
     rows.add_column(style="dim", no_wrap=True)
@@ -252,7 +250,7 @@ def view(document: Mapping[str, Any], console: Console, keys: str, ending: bool 
     return Group(_title(document, ending), rows, Text(keys, style="dim"))
 
 
-def _title(document: Mapping[str, Any], ending: bool) -> Text:
+def _title(document: Facts, ending: bool) -> Text:
     state = "stopping" if ending else str(document["state"])
     why = ", ".join(document.get("why") or ())
     time_s, duration_s = document.get("time_s") or 0.0, document.get("duration_s")
@@ -281,7 +279,7 @@ def _intensity(regions: Mapping[str, float]) -> str:
     return ", ".join(f"{region} {value:g}" for region, value in regions.items() if value != 1.0)
 
 
-def _output(sent: Mapping[str, Any]) -> str:
+def _output(sent: Facts) -> str:
     rate = f"{sent['frames_per_s']:.0f} a second" if sent["state"] == "sending" else sent["state"]
     return f"{sent['kind']}:{sent['peer']} {rate}"
 

@@ -8,30 +8,28 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import yaml
 
 from sfms_robot import __version__
+from sfms_robot.app.options import Report, RunOptions
 from sfms_robot.config import Head, load_listener
 from sfms_robot.errors import INTERRUPTED, BusError, ConfigError, ModelError, PortError, RobotError
-from sfms_robot.frames import EVENT_KINDS, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import EVENT_KINDS, ListenerEvent, SpeakerFrame
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.plugins import listener_folder
-from sfms_robot.ports import Outlet, PlanFeed, Source, Tick
+from sfms_robot.ports import Facts, Outlet, PlanFeed, Source, Tick
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.planned_events import EventWatch
 
 if TYPE_CHECKING:
     from sfms_robot.app.listen.knobs import LiveKnobs
     from sfms_robot.app.open_head import OpenHead
-    from sfms_robot.app.options import RunOptions
     from sfms_robot.outputs.sender import Outputs
-
-Report = dict[str, Any]  # plain data, as --json prints it
 
 LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
 # The head, its port and how the drive ended: keys of every report.
@@ -100,7 +98,7 @@ def figures_so_far(
     feed: PlanFeed,
     live: LiveKnobs,
     outputs: Outputs | None,
-    more: Callable[[], Mapping[str, Any]],
+    more: Callable[[], Facts],
 ) -> Report:
     """Return the figures of the report that are known while it runs, under the report's names. From any thread."""
     real = not opened.options.fast
@@ -144,7 +142,7 @@ def run_facts(head: Head, options: RunOptions) -> dict[str, str]:
     given = {name: value for name, value in values.items() if value not in (None, (), False)}
     return {
         "head": head.name,
-        "listener": Path(options.listener).name,
+        "listener": options.listener_name,
         "seed": str(options.seed),
         "port": options.port,
         "audio": Path(options.hears).name,
@@ -191,13 +189,15 @@ def event_watch(callback: Callable[[ListenerEvent], object]) -> EventWatch:
     return watch
 
 
-class OutletObserver:
-    """An `Observer` that sends sound, planned events and changes of state to one outlet of a source."""
+class OutletObserver(EventWatch):
+    """An observer that sends sound, planned events and changes of state to one outlet of a source."""
 
     def __init__(self, outlet: Outlet) -> None:
+        super().__init__()
         self._outlet = outlet
         self._state: tuple[str, tuple[str, ...]] | None = None
-        self._events = event_watch(self._event)
+        for kind in EVENT_KINDS:
+            self.on(kind, self._event)
 
     def tick(self, seen: Tick) -> None:
         state = (seen.state, seen.why)
@@ -209,18 +209,12 @@ class OutletObserver:
         if len(frame.audio):
             self._outlet.hears(frame.audio, frame.time_s)
 
-    def planned(self, plan: Plan) -> None:
-        self._events.planned(plan)
-
-    def close(self) -> None:
-        self._events.close()
-
     def _event(self, event: ListenerEvent) -> None:
         sent = {key: value for key, value in event_row(event).items() if value is not None}
         self._outlet.tells("event", event.start_s, **sent)
 
 
-def event_row(event: ListenerEvent) -> dict[str, Any]:
+def event_row(event: ListenerEvent) -> Report:
     """Return an event as it is sent to programs and pages, but for its time."""
     return {
         "event": event.kind,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from rich.console import Console
@@ -13,6 +13,7 @@ from rich.live import Live
 from rich.text import Text
 
 from sfms_robot.app.listen.panel import level_bar
+from sfms_robot.app.options import Report
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, Floats
 from sfms_robot.signals.audio import energy_db
@@ -32,7 +33,7 @@ _LOUD_DB: Final = -12.0
 
 def check_sound(
     audio: str, duration_s: float | None = None, on_level: Callable[[float, bool], None] | None = None
-) -> dict[str, Any]:
+) -> Report:
     """Listen to `audio` (as `run --audio`) for `duration_s` (`CHECK_S`), in real time, and judge it; see `judge_sound`.
 
     `on_level` is called for every frame with its level [dB of full scale] and whether it clips. Raises an error of the
@@ -55,7 +56,7 @@ def check_sound(
     return {"version": 1, "audio": audio, **judge_sound(frames), "source": statistics}
 
 
-def judge_sound(frames: Sequence[Floats]) -> dict[str, Any]:
+def judge_sound(frames: Sequence[Floats]) -> Report:
     """Judge frames (640,), which are empty where nothing came.
 
     Returns seconds, missing_frames, level_dbfs (of the loudest part: speech), noise_floor_dbfs, peak, clipped (share of
@@ -76,7 +77,7 @@ def judge_sound(frames: Sequence[Floats]) -> dict[str, Any]:
     return {**found, "findings": _findings(found)}
 
 
-def _findings(found: dict[str, Any]) -> list[str]:
+def _findings(found: Report) -> list[str]:
     if not found["seconds"] or found["missing_frames"] * FRAME_S >= found["seconds"]:
         return ["nothing came: is it plugged in, does another program hold it?"]
     findings = []

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -232,16 +232,8 @@ _PANELS: Final = (  # height, title, and the function that draws it
 # --- contact sheet: the instants -------------------------------------------------------------------------------------
 
 
-class SheetInstant(NamedTuple):
-    """One picture of a sheet: row of the motion, time, what is happening."""
-
-    row: int
-    time_s: float
-    label: str
-
-
-def pick_instants(times_s: Doubles, motion: Floats) -> list[SheetInstant]:
-    """Return twelve instants of a motion (N, 58) that show its events, in order. Raises ValueError when N = 0."""
+def pick_instants(times_s: Doubles, motion: Floats) -> dict[int, str]:
+    """Return what happens at twelve rows of a motion (N, 58), in order, by row. Raises ValueError when N = 0."""
     if not len(times_s):
         raise ValueError("a sheet needs at least one frame")
     signals = {name: _signal(motion, name) for name in _SIGNALS}
@@ -257,7 +249,7 @@ def pick_instants(times_s: Doubles, motion: Floats) -> list[SheetInstant]:
         there = [label for name, sign, least, label in _LABELS if sign * signals[name][row] > least]
         there = ["nod"] * any(begin <= row <= end for begin, _, end in nods) + there
         labels.setdefault(row, ", ".join(there[:3]) or "-")
-    return [SheetInstant(row, float(times_s[row]), labels[row]) for row in sorted(rows)]
+    return dict(sorted(labels.items()))
 
 
 def _signal(motion: Floats, name: str) -> Floats:
@@ -304,7 +296,7 @@ def _loneliest(times_s: Doubles, rows: Sequence[int]) -> int:
 # --- contact sheet: the picture --------------------------------------------------------------------------------------
 
 
-def sheet(recording: RunRecording, png: Path | str) -> list[SheetInstant]:
+def sheet(recording: RunRecording, png: Path | str) -> dict[int, str]:
     """Draw virtual head and robot at twelve instants: the face of the listener, the servos. Return the instants.
 
     A head that is not at hand, has other joints now or names no URDF is left out. Raises MissingExtra without vtk.
@@ -322,7 +314,7 @@ def sheet(recording: RunRecording, png: Path | str) -> list[SheetInstant]:
     window, human = drawing.open_window(vtk, size), load_human(hair=True)
     paper = drawing.add_renderer(vtk, window, (0, 0, 1, 1), _PAPER)
     drawing.add_text(vtk, paper, recording.title, (_GAP_PX + 4, size[1] - 42), 24).SetBold(True)
-    for index, instant in enumerate(instants):
+    for index, (row, label) in enumerate(instants.items()):
         left = _GAP_PX + index % _COLUMNS * wide
         low = size[1] - _TITLE_PX - index // _COLUMNS * high - cell_high
         cells = []
@@ -330,14 +322,14 @@ def sheet(recording: RunRecording, png: Path | str) -> list[SheetInstant]:
             x0, x1 = (left + begin) / size[0], (left + begin + width) / size[0]
             ends = x0, low / size[1], x1, (low + cell_high) / size[1]
             cells.append(drawing.add_renderer(vtk, window, ends, drawing.BACKGROUND))
-        drawing.add_head(vtk, cells[0], human, motion[instant.row])
+        drawing.add_head(vtk, cells[0], human, motion[row])
         drawing.look(cells[0], (1.07, 0.36, 0.07), (0.012, 0.0, 0.020), 17.4)  # from a little to its left
         if scene is not None:
-            drawing.add_robot(vtk, cells[1], scene, scene.values(angles_rad[instant.row].astype(np.float64)))
-        drawing.add_text(vtk, paper, f"{instant.time_s:.2f} s", (left + 4, low - 26), 19).SetBold(True)
-        drawing.add_text(vtk, paper, instant.label, (left + 96, low - 26), 19, _ACCENT).SetBold(instant.label != "-")
+            drawing.add_robot(vtk, cells[1], scene, scene.values(angles_rad[row].astype(np.float64)))
+        drawing.add_text(vtk, paper, f"{recording.times_s[row]:.2f} s", (left + 4, low - 26), 19).SetBold(True)
+        drawing.add_text(vtk, paper, label, (left + 96, low - 26), 19, _ACCENT).SetBold(label != "-")
         if recording.has_voice:
-            text = "speaker talks" if talking[instant.row] else "speaker silent"
-            drawing.add_text(vtk, paper, text, (left + 4, low - 46), 14, _PALE)
+            speaks = "talks" if talking[row] else "silent"
+            drawing.add_text(vtk, paper, f"speaker {speaks}", (left + 4, low - 46), 14, _PALE)
     drawing.save(vtk, window, png)
     return instants

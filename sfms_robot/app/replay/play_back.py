@@ -18,8 +18,8 @@ from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.page_observer import page_facts
 from sfms_robot.app.listen.page_session import stay_for_visitors
-from sfms_robot.app.listen.report import OUTCOME, Report
-from sfms_robot.app.options import SIM, HeadOptions, RunOptions
+from sfms_robot.app.listen.report import OUTCOME
+from sfms_robot.app.options import SIM, HeadOptions, Report, RunOptions
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
 from sfms_robot.app.session import Panel
 from sfms_robot.config import load_head
@@ -77,7 +77,13 @@ def show_recording(folder: Path, page: PageProcess) -> None:
     Raises ConfigError for a folder without one, and where the recorded head is not at hand or has other joints now.
     """
     recording = read_recording(folder)
-    page.say("begin", scene=recording.about["head"], **_facts(recording))
+    about, speaker = recording.about, recording.about.get("audio")
+    head = load_head(about["head"], servos=False)
+    if tuple(head.joints) != recording.joints:
+        raise ConfigError(f"head {head.name!r} has other joints than when the run was recorded")
+    options = RunOptions(port=about["port"], listener=about["listener"], seed=int(about["seed"]))
+    facts = page_facts(head, options, turned(head), DEFAULT_SPEAKER if speaker == "default" else speaker)
+    page.say("begin", scene=about["head"], **facts | {"replay": True})
     for time_s, kind in recording.events:
         page.say("event", event=kind, at_s=round(time_s, 3))
     for record in pictures(recording):
@@ -113,14 +119,3 @@ def pictures(recording: RunRecording) -> Iterator[bytes]:
             own_voice_db=NOTHING if said is None else energy_db(said[frame * FRAME_SAMPLES :][:FRAME_SAMPLES]),
             talking=bool(talking),
         )
-
-
-def _facts(recording: RunRecording) -> Report:
-    about = recording.about
-    head = load_head(about["head"], servos=False)
-    if tuple(head.joints) != recording.joints:
-        raise ConfigError(f"head {head.name!r} has other joints than when the run was recorded")
-    speaker = about.get("audio")
-    options = RunOptions(port=about["port"], listener=about["listener"], seed=int(about["seed"]))
-    facts = page_facts(head, options, turned(head), DEFAULT_SPEAKER if speaker == "default" else speaker)
-    return facts | {"replay": True}

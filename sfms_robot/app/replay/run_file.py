@@ -9,6 +9,7 @@ import struct
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,14 @@ from mcap.exceptions import EndOfFile, McapError
 from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
 
-from sfms_robot.app.listen.report import LONG, Report
+from sfms_robot.app.listen.report import LONG
+from sfms_robot.app.options import Report
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Bools, Doubles, Floats
 from sfms_robot.runtime.loop import AWAY_S
 from sfms_robot.runtime.recorder import ROS2_TOPICS, RUN_FILE, parts_of
+from sfms_robot.signals.events import runs
 from sfms_robot.signals.ros2_messages import STRING, from_cdr
 
 _PAUSE_FRAMES = 5  # a silence shorter than 0.2 s does not end a phrase
@@ -45,11 +48,11 @@ class RunRecording:
         heard_s: (M,) ends of the speaker's frames. audio: (M * 640,) zeros where there was none.
         agent_audio: (M * 640,) voice of the head itself, sample by sample beside `audio`; None where the recording has
             none.
-        energy_db: (M,). speaker: (M, 58) NaN where no face was seen. speaker_jaw_rad: (M, 3) NaN where no jaw was.
+        energy_db: (M,). speaker: (M, 58) NaN where no face was seen.
         plans: how many the listener made.
         states: (time_s, name, why) of every change, in order.
         events: (start_s, kind) of the nods, blinks and smiles that plans held.
-        servos_s: (K,) times of the other readings. servos: (K, J) by name, such as temperature_C; NaN if not reported.
+        hottest_C: of all servos; None where none reported a temperature.
         whole: the file has its end.
     """
 
@@ -65,12 +68,10 @@ class RunRecording:
     agent_audio: Floats | None
     energy_db: Doubles
     speaker: Floats
-    speaker_jaw_rad: Floats
     plans: int
     states: Sequence[tuple[float, str, tuple[str, ...]]]
     events: Sequence[tuple[float, str]]
-    servos_s: Doubles
-    servos: Mapping[str, Floats]
+    hottest_C: float | None
     whole: bool
 
     @property
@@ -95,10 +96,9 @@ class RunRecording:
         if not self.has_voice:
             return np.zeros(len(self.heard_s), dtype=np.bool_)
         loud = self.energy_db > max(_FLOOR_DB, float(np.percentile(self.energy_db, 95)) - _BELOW_LOUD_DB)
-        edges = np.flatnonzero(np.diff(loud.astype(int)))
-        for end, start in zip(edges[:-1], edges[1:], strict=True):
-            if loud[end] and start - end <= _PAUSE_FRAMES:
-                loud[end : start + 1] = True
+        for start, end in runs(~loud):
+            if start > 0 and end < len(loud) and end - start <= _PAUSE_FRAMES:
+                loud[start:end] = True
         return loud
 
     def talks_at(self, times_s: Doubles) -> Bools:
@@ -151,8 +151,6 @@ def summary(recording: RunRecording) -> Report:
     facts: Report = {key: value for key, value in recording.about.items() if key not in LONG}
     if facts.get("seed", "").isdecimal():  # facts are text
         facts["seed"] = whole_number(facts["seed"])
-    warmth_C = recording.servos.get("temperature_C", np.full(1, np.nan))
-    hottest_C = None if np.isnan(warmth_C).all() else round(float(np.nanmax(warmth_C)), 1)
     return {
         **facts,
         "duration_s": round(recording.listened_s, 3),
@@ -163,7 +161,7 @@ def summary(recording: RunRecording) -> Report:
         "states": [name for _, name, _ in recording.states],
         "joints": len(recording.joints),
         "faults": int(recording.faults.any(axis=0).sum()),
-        "hottest_C": hottest_C,
+        "hottest_C": recording.hottest_C,
         "whole": recording.whole,
     }
 
@@ -205,15 +203,14 @@ def _row(topic: str, body: Any, joints: Sequence[str]) -> Any:
                 np.float32,
             ).reshape(-1, 4)
         case "/speaker":
-            jaw_rad = np.array(body["jaw_rad"] or [None] * 3, np.float32)
             sound, said = (body[key] and _pcm16(body[key]) for key in ("audio_pcm16", "agent_audio_pcm16"))
-            return body["time_s"], body["energy_db"], _by_channel(body["face"]), jaw_rad, sound, said
+            return body["time_s"], body["energy_db"], _by_channel(body["face"]), sound, said
         case "/state":
             return body["time_s"], body["state"], tuple(body["why"])
         case "/event":
             return body["start_s"], body["kind"]
-        case "/servos":
-            return body
+        case "/servos":  # of all that is reported, the temperatures
+            return [each["temperature_C"] for each in body["servos"].values() if each.get("temperature_C") is not None]
     return None  # a plan: only counted
 
 
@@ -222,11 +219,8 @@ def _arrays(rows: _Rows, about: Mapping[str, str], joints: tuple[str, ...], whol
     times_s, moved = zip(*rows["/joints"][: len(rows["/face"])], strict=True)
     goals_rad, present_rad, ages_s, faults = np.moveaxis(np.stack(moved), 2, 0)
     present_rad[ages_s > AWAY_S] = math.nan
-    heard_s, energy_db, faces, jaws_rad, sound, said = (
-        zip(*rows["/speaker"], strict=True) if rows["/speaker"] else [()] * 6
-    )
-    servos = rows["/servos"]
-    names = {name for body in servos for reported in body["servos"].values() for name in reported} - {"fault"}
+    heard_s, energy_db, faces, sound, said = zip(*rows["/speaker"], strict=True) if rows["/speaker"] else [()] * 5
+    hottest_C = max(chain.from_iterable(rows["/servos"]), default=None)
     return RunRecording(
         about=about,
         joints=joints,
@@ -241,17 +235,10 @@ def _arrays(rows: _Rows, about: Mapping[str, str], joints: tuple[str, ...], whol
         agent_audio=_sound([None, *said[:-1]]) if any(said) else None,
         energy_db=np.array(energy_db),
         speaker=np.array(faces, np.float32).reshape(-1, MOTION_DIM),
-        speaker_jaw_rad=np.array(jaws_rad, np.float32).reshape(-1, 3),
         plans=len(rows["/plan"]),
         states=rows["/state"],
         events=rows["/event"],
-        servos_s=np.array([body["time_s"] for body in servos]),
-        servos={
-            name: np.array(
-                [[body["servos"].get(joint, {}).get(name) for joint in joints] for body in servos], np.float32
-            )
-            for name in names
-        },
+        hottest_C=None if hottest_C is None else round(hottest_C, 1),
         whole=whole,
     )
 

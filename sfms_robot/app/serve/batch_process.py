@@ -82,8 +82,7 @@ def main() -> None:
         listener = at_hop(listener, hop)
         capacity = measure_capacity(listener, SIZES if served.device == "cpu" else GPU_SIZES)
     except (RobotError, MemoryError) as error:
-        told = error if isinstance(error, RobotError) else ModelError(f"{served.listener}: {error}")
-        parent.send(("error", told))
+        parent.send(("error", error if isinstance(error, RobotError) else ModelError(f"{served.listener}: {error}")))
         return
     parent.send(("ready", capacity))
     server = StreamServer(listener, served.name, None if served.all_heads else capacity, served.server)
@@ -98,8 +97,9 @@ def _loaded(served: Served) -> Listener:
     hops = hops_of(listener)
     if served.hop is not None:
         if served.hop not in hops:
-            valid = ", ".join(map(str, hops))
-            raise ConfigError(f"--hop {served.hop}: not a hop of listener {served.listener!r} (valid: {valid})")
+            raise ConfigError(
+                f"--hop {served.hop}: not a hop of listener {served.listener!r} (valid: {', '.join(map(str, hops))})"
+            )
         return at_hop(listener, served.hop)
     p50_s, p99_s = plan_times_s(at_hop(listener, min(hops)))
     return at_hop(

@@ -15,7 +15,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from functools import partial, reduce
 from pathlib import Path
@@ -46,24 +46,26 @@ Reply = Callable[[bytes], None]
 
 log = logging.getLogger(__name__)
 
-# Name, kind, what it says, where in the statistics of `StreamServer`; those in seconds are in milliseconds there.
-_FIGURES: Final = (
-    ("heads", "gauge", "Heads that are listened for", "heads"),
-    ("heads_most", "gauge", "Heads that could be answered in time", "most_heads"),
-    ("plans", "counter", "Plans made", "plans"),
-    ("deadline_misses", "counter", "Plans later than the deadline", "deadline_misses"),
-    ("deadline_seconds", "gauge", "Promised from a frame to its plan", "deadline_ms"),
-    ("plan_delay_p50_seconds", "gauge", "Median from a frame to its plan, of the last plans", "delay_ms.p50"),
-    ("plan_delay_p99_seconds", "gauge", "99th percentile of the same", "delay_ms.p99"),
-    ("batches", "counter", "Batches stepped", "batches"),
-    ("steps", "counter", "Frames stepped, over all heads", "steps"),
-    ("batch_size_p50", "gauge", "Median of the heads in a batch", "batch_size.p50"),
-    ("batch_size_p99", "gauge", "99th percentile of the same", "batch_size.p99"),
-    ("frames_skipped", "counter", "Frames left out, since too many were waiting", "skipped_frames"),
-    ("frames_lost", "counter", "Frames that never came", "lost_frames"),
-    ("refused", "counter", "Robots that were refused", "refused"),
-    ("malformed", "counter", "Messages that could not be read", "malformed"),
-    ("cost_scale", "gauge", "How much longer batches take than measured at the start", "cost_scale"),
+# Name, what it says, where in the statistics of `StreamServer`; those in seconds are in milliseconds there.
+_GAUGES: Final = (
+    ("heads", "Heads that are listened for", "heads"),
+    ("heads_most", "Heads that could be answered in time", "most_heads"),
+    ("deadline_seconds", "Promised from a frame to its plan", "deadline_ms"),
+    ("plan_delay_p50_seconds", "Median from a frame to its plan, of the last plans", "delay_ms.p50"),
+    ("plan_delay_p99_seconds", "99th percentile of the same", "delay_ms.p99"),
+    ("batch_size_p50", "Median of the heads in a batch", "batch_size.p50"),
+    ("batch_size_p99", "99th percentile of the same", "batch_size.p99"),
+    ("cost_scale", "How much longer batches take than measured at the start", "cost_scale"),
+)
+_COUNTERS: Final = (
+    ("plans", "Plans made", "plans"),
+    ("deadline_misses", "Plans later than the deadline", "deadline_misses"),
+    ("batches", "Batches stepped", "batches"),
+    ("steps", "Frames stepped, over all heads", "steps"),
+    ("frames_skipped", "Frames left out, since too many were waiting", "skipped_frames"),
+    ("frames_lost", "Frames that never came", "lost_frames"),
+    ("refused", "Robots that were refused", "refused"),
+    ("malformed", "Messages that could not be read", "malformed"),
 )
 
 
@@ -117,7 +119,10 @@ class WorkerPool:
 
         `reply` is called from one of the pool's threads, or never: a robot without an answer asks again.
         """
-        client = _client(message)
+        client = None
+        with suppress(PacketError):  # which the process refuses
+            if isinstance(words := parse_words(message), Join):
+                client = words.client
         with self._changed:
             serving = [each for each in self._workers if each.capacity is not None]
             if not serving:
@@ -215,15 +220,6 @@ class _Worker:
     def clients_to_be(self) -> set[str | None]:
         """Return the clients that it has, or will have."""
         return {*self.clients.values(), *(client for client, _ in self.requests.values())}
-
-
-def _client(message: bytes) -> str | None:
-    """Return the client of a request; None for a message that the process will refuse."""
-    try:
-        words = parse_words(message)
-    except PacketError:
-        return None
-    return words.client if isinstance(words, Join) else None
 
 
 def serve(
@@ -339,10 +335,10 @@ class _Collector:
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
         statistics = self._statistics()
-        for name, kind, text, place in _FIGURES:
+        families = [(GaugeMetricFamily, each) for each in _GAUGES] + [(CounterMetricFamily, each) for each in _COUNTERS]
+        for family, (name, text, place) in families:
             value: Any = reduce(lambda found, key: found[key], place.split("."), statistics)
             if value is not None:
-                family = CounterMetricFamily if kind == "counter" else GaugeMetricFamily
                 metric = family(f"sfms_{name}", text, labels=["listener", "server"])
                 factor = 1e-3 if name.endswith("_seconds") else 1.0
                 metric.add_metric([statistics["listener"], statistics["server"]], float(value) * factor)

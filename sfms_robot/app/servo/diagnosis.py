@@ -7,13 +7,13 @@ good to know or is corrected by the run itself.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, field, replace
 from itertools import chain
 from shlex import quote
-from typing import Any, Final, Literal, cast
+from typing import Final, Literal, cast
 
-from sfms_robot.app.options import SIM
+from sfms_robot.app.options import SIM, Report
 from sfms_robot.app.servo.serial_line import FoundServo
 from sfms_robot.app.servo.single_servo import ServoState
 from sfms_robot.config import Faults
@@ -58,7 +58,7 @@ class Finding:
     _: KW_ONLY
     servo: int | None = None
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> Report:
         """Return it for a report."""
         return {key: value for key, value in asdict(self).items() if key != "servo"}
 
@@ -92,7 +92,6 @@ class Line:
     Attributes:
         shown: Its name in commands.
         ports: The ports of the whole head, as `--port` named them.
-        control: Of an emulator, which confirms silences there.
     """
 
     device: str
@@ -104,7 +103,6 @@ class Line:
     bus: str | None = None
     head: str | None = None
     ports: str | None = None
-    control: str | None = None
     crc: bool = False
 
     @property
@@ -167,8 +165,7 @@ def judge_opening(path: str, failure: str, held_by: Sequence[Holder]) -> Iterato
 
 def _holders(severity: Severity, path: str, held_by: Sequence[Holder], too: str) -> Iterator[Finding]:
     for holder in held_by:
-        problem = f"is open in process {holder.pid} ({holder.command}){too}"
-        yield Finding(severity, path, problem, f"kill {holder.pid}")
+        yield Finding(severity, path, f"is open in process {holder.pid} ({holder.command}){too}", f"kill {holder.pid}")
 
 
 def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[Finding]:
@@ -176,8 +173,7 @@ def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[F
     yield from _holders("warning", device.path, held_by, " too")
     if device.latency_ms is not None and device.latency_ms > FAST_ENOUGH_MS:
         fix = f"echo 1 | sudo tee {device.latency_file}  (until it is unplugged; for good: the udev rule below)"
-        problem = f"the adapter holds every answer back for {device.latency_ms} ms"
-        yield Finding("warning", device.path, problem, fix)
+        yield Finding("warning", device.path, f"the adapter holds every answer back for {device.latency_ms} ms", fix)
 
 
 def udev_rule(device: SerialDevice) -> str | None:
@@ -201,49 +197,45 @@ def udev_rule(device: SerialDevice) -> str | None:
 # --- which servos answer ----------------------------------------------------------------------------------------
 
 
-def judge_presence(
-    line: Line, here: Mapping[int, FoundServo], elsewhere: Mapping[int, FoundServo], baud: int, hint: str = ""
-) -> Iterator[Finding]:
+def judge_presence(line: Line, found: Iterable[FoundServo], baud: int, hint: str = "") -> Iterator[Finding]:
     """Yield ids of the head that are silent, at another rate, or of another model; and ids that the head does not name.
 
     Args:
-        here: Servos that answer at the head's rate, by id.
-        elsewhere: Servos that answer at another one.
+        found: Servos that answer, at whatever rate.
+        baud: The head's rate.
         hint: The protocol to which servos answer instead.
     """
-    if line.wanted and not here and not elsewhere:
+    by_id = {seen.id: seen for seen in found}
+    if line.wanted and not by_id:
         problem = f"no answer at any rate: none of {len(line.wanted)} servos{f'; {hint}' if hint else ''}"
         yield Finding("error", "bus", problem, "check power, cable, data direction of the adapter, and --port")
         return
     for servo, want in line.wanted.items():
-        problem, fix = "", ""
-        if (seen := here.get(servo)) is not None:
-            if want.model_number is not None and seen.model_number not in (None, want.model_number):
-                said = f"the head says {want.model} ({want.model_number})"
-                number = f" ({seen.model_number})" if seen.table is not None else ""  # an unknown model has it already
-                problem = f"{seen.model}{number} answers, {said}"
-                fix = "two cables swapped, or the head's file names the wrong model or id"
-        elif servo in elsewhere:
-            rate = elsewhere[servo].baud
-            problem = f"set to {rate} baud, the head says {baud}"
-            fix = line.servo(f"set-baud {{id}} {baud}", rate)
-        else:
+        if (seen := by_id.get(servo)) is None:
             problem, look = "no answer, at any rate", line.servo("scan")
             fix = f"check its cable; if it has another id: {look}, then {line.servo('set-id OLD NEW')}"
-        if problem:
-            yield Finding("error", line.name(servo), problem, fix, servo=servo)
-    for servo, seen in sorted({**elsewhere, **here}.items()):
+        elif seen.baud != baud:
+            problem = f"set to {seen.baud} baud, the head says {baud}"
+            fix = line.servo(f"set-baud {{id}} {baud}", seen.baud)
+        elif want.model_number is not None and seen.model_number not in (None, want.model_number):
+            said = f"the head says {want.model} ({want.model_number})"
+            number = f" ({seen.model_number})" if seen.table is not None else ""  # an unknown model has it already
+            problem = f"{seen.model}{number} answers, {said}"
+            fix = "two cables swapped, or the head's file names the wrong model or id"
+        else:
+            continue
+        yield Finding("error", line.name(servo), problem, fix, servo=servo)
+    for servo, seen in sorted(by_id.items()):
         if line.wanted and servo not in line.wanted:
             problem = f"{seen.model} at {seen.baud} baud is not in the head's file"
             yield Finding("warning", line.name(servo), problem, servo=servo)
 
 
-def judge_duplicate_ids(ids: Sequence[int], line: Line) -> Iterator[Finding]:
-    """Yield the ids to which two servos seem to answer."""
-    for servo in ids:
-        problem = "two servos seem to answer to this id (or the wire is disturbed)"
-        fix = f"unplug all but one of them, then: {line.servo(f'set-id {servo} NEW')}"
-        yield Finding("error", f"id {servo}", problem, fix, servo=servo)
+def duplicate_id(servo: int, line: Line) -> Finding:
+    """Return the problem of an id to which two servos seem to answer."""
+    problem = "two servos seem to answer to this id (or the wire is disturbed)"
+    fix = f"unplug all but one of them, then: {line.servo(f'set-id {servo} NEW')}"
+    return Finding("error", f"id {servo}", problem, fix, servo=servo)
 
 
 # --- one servo --------------------------------------------------------------------------------------------------
@@ -342,9 +334,6 @@ def stored_contradictions(state: ServoState, want: Wanted | None) -> list[Contra
 # --- the bus ----------------------------------------------------------------------------------------------------
 
 
-Budget = dict[str, Any]
-
-
 def wire_budget(
     family: str,
     servos: int,
@@ -356,7 +345,7 @@ def wire_budget(
     *,
     together: bool = True,
     crc: bool = False,
-) -> Budget:
+) -> Report:
     """Return the budget of a bus: bytes, ms and Hz of a tick that writes goals, and of one that reads every servo too.
 
     `plain` is one sync read, or one read after the other where the family has none, and None of a board; `fast` one
@@ -397,7 +386,7 @@ def wire_budget(
     }
 
 
-def judge_rate(budget: Budget, line: Line, fast_works: bool | None = None) -> Iterator[Finding]:
+def judge_rate(budget: Report, line: Line, fast_works: bool | None = None) -> Iterator[Finding]:
     """Yield a finding where goals and answers of all servos do not fit into a tick."""
     usual, least_hz = budget["plain"] or budget["write_only"], _ROUND * line.rate_hz
     if usual["hz"] >= least_hz:

@@ -6,24 +6,24 @@ another rate, of another model or not in the file, and whether the bus reaches t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from functools import partial
-from typing import Any, Final, cast
+from typing import Final, cast
 
-from sfms_robot.app.options import SIM
+from sfms_robot.app.options import SIM, Report
 from sfms_robot.app.progress import Progress, no_progress
 from sfms_robot.app.servo.diagnosis import (
     SEVERITIES,
-    Budget,
     Finding,
     Line,
     Wanted,
+    duplicate_id,
     grouped,
     judge_adapter,
     judge_board,
-    judge_duplicate_ids,
     judge_opening,
     judge_port,
     judge_presence,
@@ -44,10 +44,9 @@ from sfms_robot.app.servo.serial_line import (
     protocol_hint,
 )
 from sfms_robot.app.servo.single_servo import ServoState, read_all, scan
-from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
-from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.boards import RateLimitedPort, board_for, board_problem
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
@@ -64,9 +63,7 @@ _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still wait
 _BOARD_S: Final = 0.2  # a board answers at once; 9600 baud and a USB adapter take the rest
 _READ: Final = ("present_position", "present_speed", "present_load", "present_current")
 
-Report = dict[str, Any]
-OpenPort = Callable[[str, int], Port]
-Found = Mapping[int, FoundServo]  # by id
+OpenPort = Callable[[], Port]  # raises PortError
 
 
 def examine(
@@ -91,32 +88,22 @@ def examine(
             raise ConfigError(f"{key} {value}: head {head!r} says that of each of its buses; leave out one of the two")
     family = family or DEFAULT_FAMILY
     check_baud(family, baud)
-    clock = RealClock()
     with ExitStack() as stack:
         lines = list(_lines(port, head, family, baud, stack))
-        buses = [examine_line(line, clock, partial(_port, line.control, clock), progress, fix) for line in lines]
+        buses = [examine_line(line, open_port, progress, fix) for line, open_port in lines]
     codes = {bus["exit_code"] for bus in buses}
     return {
         "version": 1,
         "head": head,
-        "port": port or lines[0].device,
+        "port": port or lines[0][0].device,
         "buses": buses,
         "findings": sum((each["findings"] for each in buses), []),
         "exit_code": next((code for code in (PORT_FAILED, BUS_FAILED) if code in codes), FINE),
     }
 
 
-def _port(control: str | None, clock: Clock, device: str, baud: int) -> Port:
-    """Open a device, on emulated servos as a run does: a silence is one only if the emulator confirms it."""
-    if control is None:
-        return SerialPort(device, baud, clock)
-    from sfms_robot.app.wiring import EmulatedPort
-
-    return EmulatedPort(device, control, baud, clock)
-
-
 def examine_line(
-    line: Line, clock: Clock, open_port: OpenPort, progress: Progress = no_progress, fix: Confirm | None = None
+    line: Line, open_port: OpenPort, progress: Progress = no_progress, fix: Confirm | None = None
 ) -> Report:
     """Look at one port; return a report with `adapter`, `servos`, `budget`, `fixed`, `findings`, `exit_code`."""
     path, problem = line.device, access_problem(line.device)
@@ -128,7 +115,7 @@ def examine_line(
         return _finished(report, [failed, *others], PORT_FAILED)
     held_by = [] if line.is_terminal else holders(path)
     try:
-        port = open_port(path, line.first_baud)
+        port = open_port()
     except PortError as error:
         return _finished(report, [*judge_opening(path, str(error), held_by), *others], PORT_FAILED)
     with closing(port):
@@ -138,7 +125,7 @@ def examine_line(
             if family_named(line.family).board:
                 found, facts = _look_at_board(line, port, adapter)
             else:
-                found, facts = _look(line, Wire(port, line.family, clock, line.first_baud), adapter, progress, fix)
+                found, facts = _look(line, Wire(port, line.family, line.first_baud), adapter, progress, fix)
         except (BusError, PacketError, ServoError) as error:
             found = [Finding("error", path, str(error).removeprefix(f"{path}: "), "check plug and cable")]
         else:
@@ -149,19 +136,25 @@ def examine_line(
 def _finished(report: Report, findings: Iterable[Finding], failed: int = BUS_FAILED) -> Report:
     together = grouped(findings)
     counts = {name: sum(each.severity == name for each in together) for name in SEVERITIES}
-    found = [each.plain() for each in together]
-    return {**report, "findings": found, "counts": counts, "exit_code": failed if counts["error"] else FINE}
+    code = failed if counts["error"] else FINE
+    return {**report, "findings": [each.plain() for each in together], "counts": counts, "exit_code": code}
 
 
 # --- what to look at ------------------------------------------------------------------------------------------------
 
 
-def _lines(port: str | None, head: str | None, family: str, baud: int | None, stack: ExitStack) -> Iterator[Line]:
+def _lines(
+    port: str | None, head: str | None, family: str, baud: int | None, stack: ExitStack
+) -> Iterator[tuple[Line, OpenPort]]:
+    """Yield the lines to look at; the ports of a head are opened as its run opens them."""
+    clock = RealClock()
     if head is None:
         device = port or only_port()
-        yield Line(device=device, shown=device, family=family, baud=baud)
+        line = Line(device=device, shown=device, family=family, baud=baud)
+        yield line, partial(SerialPort, device, line.first_baud, clock)
         return
-    from sfms_robot.app.wiring import open_wires  # slow to load, and only a head needs it
+    from sfms_robot.app.open_head import bus_servos  # slow to load, and only a head needs them
+    from sfms_robot.app.wiring import calibration_of, open_wires, port_of
 
     described = load_head(head)
     where = stack.enter_context(open_wires(described, port or only_port()))
@@ -169,38 +162,33 @@ def _lines(port: str | None, head: str | None, family: str, baud: int | None, st
         described = layered(described, load_overlay(described), head_hash(head)).head  # as it was measured
     for name, each in where.items():
         bus, device = described.buses[name], each if isinstance(each, str) else each.device
-        yield Line(
+        open_port: OpenPort = partial(SerialPort, device, bus.baud, clock, bus.rs485)
+        if not isinstance(each, str):
+            open_port = port_of(each, bus, clock)
+        joints = {key: joint for key, joint in described.joints.items() if joint.bus == name}
+        servos = bus_servos(described, joints)
+        line = Line(
             device=device,
             shown=SIM if port == SIM else device,
             family=bus.family,
             baud=bus.baud,
             rate_hz=bus.rate_hz,
-            wanted=_wanted(described, name),
+            wanted={
+                servo.id: Wanted(
+                    joint=servo.joint,
+                    model=servo.table.model,
+                    model_number=servo.table.model_number,
+                    faults=described.faults,
+                    needs=needs,
+                )
+                for servo, needs in zip(servos, needs_of(servos, calibration_of(joints)), strict=True)
+            },
             bus=name,
             head=head,
             ports=port,
-            control=None if isinstance(each, str) else each.control,
             crc=bus.crc,
         )
-
-
-def _wanted(head: Head, bus: str) -> dict[int, Wanted]:
-    """Return the servos of a bus as the head's file describes them, by id."""
-    from sfms_robot.app.open_head import bus_servos
-    from sfms_robot.app.wiring import calibration_of
-
-    joints = {name: joint for name, joint in head.joints.items() if joint.bus == bus}
-    servos = bus_servos(head, joints)
-    return {
-        servo.id: Wanted(
-            joint=servo.joint,
-            model=joints[servo.joint].model,
-            model_number=servo.table.model_number,
-            faults=head.faults,
-            needs=needs,
-        )
-        for servo, needs in zip(servos, needs_of(servos, calibration_of(joints)), strict=True)
-    }
+        yield line, open_port
 
 
 # --- a chain of servos ----------------------------------------------------------------------------------------------
@@ -210,60 +198,75 @@ def _look(
     line: Line, wire: Wire, adapter: SerialDevice, progress: Progress, fix: Confirm | None
 ) -> tuple[list[Finding], Report]:
     """Return findings and facts that need the open port."""
-    here, elsewhere = _present(wire, line, progress)
-    baud = line.baud or next((seen.baud for seen in here.values()), wire.baud)
-    hint = "" if here or elsewhere else protocol_hint(other_wires(wire))
-    findings = list(judge_presence(line, here, elsewhere, baud, hint))
+    baud, found = _present(wire, line, progress)
+    hint = "" if found else protocol_hint(other_wires(wire))
+    findings = list(judge_presence(line, found, baud, hint))
     fixed: list[str] = []
     states: list[ServoState] = []
-    double: list[int] = []
-    for done, seen in enumerate([*here.values(), *elsewhere.values()]):
-        progress(done, len(here) + len(elsewhere), f"id {seen.id}")
+    for done, seen in enumerate(found):
+        progress(done, len(found), f"id {seen.id}")
         wire.at(seen.baud)
-        double += [seen.id] if wire.has_duplicate(seen.id) else []
+        if wire.has_duplicate(seen.id):
+            findings.append(duplicate_id(seen.id, line))
         try:
             state = read_all(seen)
             if fix is not None and (done_here := _fix(state, line, fix)):
                 fixed += done_here
                 state = read_all(seen)
             states.append(state)
+            findings += judge_servo(state, line)
         except ServoError as error:
             level = seen.table.role("status_level") if seen.table else None
             cure = line.servo(f"write {{id}} {level.name} {level.high}", seen.baud) if level else ""
             findings.append(Finding("error", f"id {seen.id}", str(error), cure, servo=seen.id))
-    findings += judge_duplicate_ids(double, line)
-    for state in states:
-        findings += judge_servo(state, line)
-    members = [state for state in states if state.seen.id in here and state.seen.table is not None]
+    members = [state for state in states if state.seen.baud == baud and state.seen.table is not None]
     wire.at(baud)
-    fast = _fast_read_works(wire, members)
-    budget = _budget(line, baud, members, adapter)
-    if budget is not None:
+    fast, budget = _fast_read_works(wire, members), None
+    if members:
+        table = members[0].seen.registers()
+        goal = table.role("goal_position")
+        budget = wire_budget(
+            line.family,
+            max(len(line.wanted), len(members)),
+            baud,
+            return_delay_us=max(state.in_unit("return_delay") or 0.0 for state in members),
+            latency_ms=0.0 if line.is_terminal else _USB_MS if adapter.latency_ms is None else adapter.latency_ms,
+            read_bytes=table.span([field.name for role in _READ if (field := table.role(role)) is not None])[1],
+            write_bytes=goal.size if goal else 2,
+            together=table.byte_order == "little",
+        )
         findings += judge_rate(budget, line, fast)
-    facts = {"baud": baud, "rate_hz": line.rate_hz, "servos": [_servo_row(state, line) for state in states]}
-    return findings, facts | {"fixed": fixed, "fast_sync_read": fast, "budget": budget}
+    return findings, {
+        "baud": baud,
+        "rate_hz": line.rate_hz,
+        "servos": [_servo_row(state, line) for state in states],
+        "fixed": fixed,
+        "fast_sync_read": fast,
+        "budget": budget,
+    }
 
 
-def _present(wire: Wire, line: Line, progress: Progress) -> tuple[Found, Found]:
-    """Return the servos at the line's rate and at others, by id.
+def _present(wire: Wire, line: Line, progress: Progress) -> tuple[int, Sequence[FoundServo]]:
+    """Return the line's rate, or the one that most servos have, and the servos, those at this rate first.
 
     With a head, other rates are looked at only for ids that are missing.
     """
     if line.baud is None and not line.wanted:
-        found = scan(wire, None, progress)
-        usual = max({each.baud for each in found}, key=lambda b: sum(s.baud == b for s in found), default=0)
-        return {s.id: s for s in found if s.baud == usual}, {s.id: s for s in found if s.baud != usual}
+        every = scan(wire, None, progress)
+        rates = Counter(seen.baud for seen in every)
+        usual = max(rates, key=rates.__getitem__, default=wire.baud)
+        return usual, sorted(every, key=lambda seen: seen.baud != usual)
     wanted = list(line.wanted)
-    here = _at_this_rate(wire, line, wanted) or _at_this_rate(wire, line, wanted)  # one lost packet hides no bus
-    elsewhere: dict[int, FoundServo] = {}
+    found = _at_this_rate(wire, line, wanted) or _at_this_rate(wire, line, wanted)  # one lost packet hides no bus
     for step, _ in enumerate(wire.reachable()):
-        missing = [servo for servo in line.wanted if servo not in here and servo not in elsewhere]
+        missing = [servo for servo in line.wanted if servo not in found]
         if not missing:
             break
         if step:
             progress(step, len(wire.bauds), f"{len(missing)} missing, {wire.baud} baud")
-            elsewhere |= {i: seen for i, seen in _at_this_rate(wire, line, missing).items() if i not in here}
-    return here, elsewhere
+            for servo, seen in _at_this_rate(wire, line, missing).items():
+                found.setdefault(servo, seen)
+    return line.first_baud, list(found.values())
 
 
 def _at_this_rate(wire: Wire, line: Line, ids: Sequence[int]) -> dict[int, FoundServo]:
@@ -299,17 +302,13 @@ def _fix(state: ServoState, line: Line, confirm: Confirm) -> list[str]:
         seen.guard(change, lambda question: True)
         if (field := seen.named(each.register)).writable:
             seen.put(field, each.wanted)
-        else:
-            _clear_turns(seen)
+        else:  # its position is brought into one turn; the shaft stays where it is
+            link = cast(Dynamixel2Link, seen.wire.link)
+            answer = link.clear_turns(seen.id)
+            if answer is None or (refusal := link.refusal(answer)):
+                raise ServoError(f"id {seen.id} does not clear its turns: {refusal if answer else 'no answer'}")
         done.append(f"id {seen.id}: {change}")
     return done
-
-
-def _clear_turns(seen: FoundServo) -> None:
-    """Bring the position of a servo into one turn; the shaft stays where it is."""
-    answer = cast(Dynamixel2Link, seen.wire.link).clear_turns(seen.id)
-    if answer is None or (refusal := seen.wire.link.refusal(answer)):
-        raise ServoError(f"id {seen.id} does not clear its turns: {refusal if answer else 'no answer'}")
 
 
 def _fast_read_works(wire: Wire, members: Sequence[ServoState]) -> bool | None:
@@ -324,23 +323,6 @@ def _fast_read_works(wire: Wire, members: Sequence[ServoState]) -> bool | None:
     return any(set(wire.link.read_many(*where, alike, fast=True)) == set(alike) for _ in range(2))
 
 
-def _budget(line: Line, baud: int, members: Sequence[ServoState], adapter: SerialDevice) -> Budget | None:
-    if not members:
-        return None
-    table = members[0].seen.registers()
-    goal = table.role("goal_position")
-    return wire_budget(
-        line.family,
-        max(len(line.wanted), len(members)),
-        baud,
-        return_delay_us=max(state.in_unit("return_delay") or 0.0 for state in members),
-        latency_ms=0.0 if line.is_terminal else _USB_MS if adapter.latency_ms is None else adapter.latency_ms,
-        read_bytes=table.span([field.name for role in _READ if (field := table.role(role)) is not None])[1],
-        write_bytes=goal.size if goal else 2,
-        together=table.byte_order == "little",
-    )
-
-
 def _servo_row(state: ServoState, line: Line) -> Row:
     want = line.wanted.get(state.seen.id)
     measured = state.measured(1, voltage_V="voltage", temperature_degC="temperature", return_delay_us="return_delay")
@@ -353,12 +335,9 @@ def _servo_row(state: ServoState, line: Line) -> Row:
 
 def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[Finding], Report]:
     """Return what can be said of a board, whose port could be opened."""
-    channels = max(1, len(line.wanted))
-    budget = wire_budget(line.family, channels, line.first_baud, crc=line.crc)
+    budget = wire_budget(line.family, max(1, len(line.wanted)), line.first_baud, crc=line.crc)
     table = Table.of(load_firmware_map(next(iter(line.wanted.values())).model))
     wire = RateLimitedPort(port, line.first_baud, _BOARD_S)
     problem = board_problem(table, board_for(table, line.crc), wire)
-    found = judge_board(line.family, len(line.wanted), problem, adapter)
-    findings = [*found, *judge_rate(budget, line)]
-    facts = {"baud": line.first_baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": budget}
-    return findings, facts
+    findings = [*judge_board(line.family, len(line.wanted), problem, adapter), *judge_rate(budget, line)]
+    return findings, {"baud": line.first_baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": budget}

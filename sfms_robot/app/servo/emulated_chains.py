@@ -49,9 +49,22 @@ def emulators(
 
     The arguments are the options of `cli.emulate_command`. Raises ConfigError, BusError.
     """
-    settings = {key: value for key, value in (("baud", baud), ("supply_v", voltage)) if value is not None}
-    changes = [("stored", each) for each in stored] + [("start", each) for each in starts]
-    wires = _servos(head, servo, settings, changes)
+    settings: dict[str, Any] = {
+        key: value for key, value in (("baud", baud), ("supply_v", voltage)) if value is not None
+    }
+    if (head is None) == (servo is None):
+        raise ConfigError("emulate needs either --head NAME or --servo MODEL:IDS[,MODEL:IDS...]")
+    if head is not None:
+        from sfms_robot.app.wiring import plugged_in  # brings numpy and all that drives a head: a list needs none
+
+        wires = plugged_in(load_head(head))
+    else:
+        wires = {"servos": parse_servos(servo or "")}
+    for servos in wires.values():
+        servos[:] = [replace(each, **settings) for each in servos]
+    for option, texts in (("stored", stored), ("start", starts)):
+        for text in texts:
+            _change(option, text, wires.values())
     specs = _faults(faults)
     with ExitStack() as stack:
         chains = {}
@@ -91,25 +104,6 @@ def until_stopped(chains: Mapping[str, Chain]) -> None:
         if hasattr(signal, each):  # Windows has no SIGHUP
             signal.signal(getattr(signal, each), leave)
     raise BusError(f"the emulated chain {wait(list(chains.values())).device} has ended")
-
-
-def _servos(
-    head: str | None, servo: str | None, settings: dict[str, Any], changes: Sequence[tuple[str, str]]
-) -> dict[str, list[EmulatedServo]]:
-    """Return the servos of each bus, with `settings`, then with changes (option, text)."""
-    if (head is None) == (servo is None):
-        raise ConfigError("emulate needs either --head NAME or --servo MODEL:IDS[,MODEL:IDS...]")
-    if head is not None:
-        from sfms_robot.app.wiring import plugged_in  # brings numpy and all that drives a head: a list needs none
-
-        wires = plugged_in(load_head(head))
-    else:
-        wires = {"servos": parse_servos(servo or "")}
-    for servos in wires.values():
-        servos[:] = [replace(each, **settings) for each in servos]
-    for option, text in changes:
-        _change(option, text, wires.values())
-    return wires
 
 
 def _change(option: str, text: str, wires: Collection[list[EmulatedServo]]) -> None:

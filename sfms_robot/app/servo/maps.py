@@ -24,7 +24,7 @@ class MapProblem(NamedTuple):
 Loaded = dict[Path, FirmwareMap]
 
 
-def check_maps(more: Iterable[Path] = ()) -> list[MapProblem]:
+def check_maps(more: Iterable[Path]) -> list[MapProblem]:
     """Return the mistakes of the shipped maps, and of the files and folders of `more`."""
     loaded: Loaded = {}
     findings = []

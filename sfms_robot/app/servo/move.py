@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from contextlib import closing
 from typing import Final
 
-from sfms_robot.app.open_head import build_one
+from sfms_robot.app.open_head import build_one, bus_servos
 from sfms_robot.app.servo.serial_line import TRIES, FoundServo, Row, Wire
 from sfms_robot.app.servo.single_servo import parse_number, scan
 from sfms_robot.app.wiring import Opened, open_wires, port_of
-from sfms_robot.config import Head, load_firmware_map, load_head
+from sfms_robot.config import Head, load_head
 from sfms_robot.errors import BusError, ConfigError, PortError, RobotError, ServoError, TorqueError
 from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
@@ -41,7 +41,7 @@ def move(seen: FoundServo, to: str | None, by: str | None) -> Row:
     Raises ConfigError for a goal outside its limits, ServoError for one that is not in position mode, refuses, or does
     not get there; it then stops where it is.
     """
-    table, clock = seen.registers(), seen.wire.clock
+    table, clock = seen.registers(), seen.wire.port
     goal_field, present, torque = (seen.named(n) for n in ("goal_position", "present_position", "torque_enable"))
     _check_mode(seen)
     start = seen.read(present)
@@ -128,7 +128,7 @@ def _torque_off(seen: FoundServo, torque: Field) -> None:
 
 def _settled(seen: FoundServo, present: Field, target: int) -> int:
     """Return the position once the servo is close to `target`. Raises ServoError."""
-    clock = seen.wire.clock
+    clock = seen.wire.port
     end_s = clock.now_s() + SETTLE_S
     while abs((now := seen.read(present)) - target) > _ticks(seen.registers(), CLOSE_DEG):
         if clock.now_s() >= end_s:
@@ -165,8 +165,8 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
     failures: list[RobotError] = []
     for name, where in opened.items():
         joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
-        names = {joint.id: key for key, joint in joints.items()}
-        bus, tables = head.buses[name], {j.id: Table.of(load_firmware_map(j.model)) for j in joints.values()}
+        bus, servos = head.buses[name], bus_servos(head, joints)
+        names, tables = {each.id: each.joint for each in servos}, {each.id: each.table for each in servos}
         try:
             if family_named(bus.family).board:
                 most = max((table.channels or 0 for table in tables.values()), default=0)
@@ -175,7 +175,7 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
                 off = dict.fromkeys(channels, "" if board is None or board.end_pulses(channels) else SILENT)
             else:
                 with closing(port_of(where, bus, clock)()) as port:
-                    wire = Wire(port, bus.family, clock, bus.baud, fixed=True)
+                    wire = Wire(port, bus.family, bus.baud, fixed=True)
                     off = release_chain(wire, tables, everything)
         except (PortError, BusError) as error:
             failures.append(error)

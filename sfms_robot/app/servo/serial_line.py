@@ -19,7 +19,6 @@ from sfms_robot.app.options import SIM
 from sfms_robot.config import load_firmware_map, load_head, map_files, variant
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
-from sfms_robot.ports import Clock
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, finish, ping_replies, verified_write
 from sfms_robot.servo.discovery import check_device, list_ports
@@ -148,7 +147,6 @@ class Wire:
         self,
         port: Port,
         family: str,
-        clock: Clock,
         baud: int,
         fixed: bool = False,
         model: str | None = None,
@@ -157,7 +155,6 @@ class Wire:
         self.port = port
         self.family = family
         self.kind = _family(family)
-        self.clock = clock
         self.model = model
         self._table = None if model is None else Table.of(load_firmware_map(model))
         self.bauds = (baud,) if fixed else (baud, *(each for each in self.kind.bauds if each != baud))
@@ -206,8 +203,10 @@ class Wire:
             seen = self.ping(servo, TRIES if len(self.bauds) == 1 else 2)
             if seen is not None:
                 return seen
-        rates = ", ".join(str(baud) for baud in self.bauds)
-        raise BusError(f"{self.port.name}: no answer from id {servo} at {rates} baud (look: {self.command('scan')})")
+        raise BusError(
+            f"{self.port.name}: no answer from id {servo} at {', '.join(map(str, self.bauds))} baud "
+            f"(look: {self.command('scan')})"
+        )
 
     def reachable(self) -> Iterator[int]:
         """Yield every rate to look at, the wire set to it. Rates that the adapter cannot do are skipped."""
@@ -265,15 +264,16 @@ def open_wire(port: str | None, family: str, baud: int | None, head: str, model:
             check_device(device)
             line = SerialPort(device, baud or first, clock)
         stack.callback(line.close)
-        yield Wire(line, family, clock, baud or first, fixed=baud is not None, model=model, place=place)
+        yield Wire(line, family, baud or first, fixed=baud is not None, model=model, place=place)
 
 
 def check_baud(family: str, baud: int | None) -> None:
     """Raise ConfigError for a rate beyond those of the family: at 5 baud a question takes minutes."""
     kind = _family(family)
     if baud is not None and kind.bauds and not min(kind.bauds) <= baud <= max(kind.bauds):
-        rates = ", ".join(str(each) for each in sorted(kind.bauds))
-        raise ConfigError(f"--baud {baud}: not a rate of {kind.title} servos ({rates})")
+        raise ConfigError(
+            f"--baud {baud}: not a rate of {kind.title} servos ({', '.join(map(str, sorted(kind.bauds)))})"
+        )
 
 
 def only_port() -> str:
@@ -336,7 +336,7 @@ def other_wires(wire: Wire) -> Iterator[Wire]:
             for baud in family.bauds[:_RATES] if name != wire.family else ():
                 with suppress(PortError):  # of an adapter that cannot do this rate
                     wire.at(baud)
-                    other = Wire(wire.port, name, wire.clock, baud, fixed=True)
+                    other = Wire(wire.port, name, baud, fixed=True)
                     other.link.silence_s = _ID_S
                     ids = None if family.protocol == 2 else range(1, _FIRST_IDS + 1)
                     if any(seen.table is not None for seen in other.answering(ids)):

@@ -62,9 +62,7 @@ def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_p
     return found
 
 
-def scan_all(
-    wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_progress
-) -> tuple[list[FoundServo], str]:
+def scan_all(wire: Wire, ids: Sequence[int] | None, progress: Progress = no_progress) -> tuple[list[FoundServo], str]:
     """Return the servos of `scan` and those of other families on the same wire, and the `--family` of these.
 
     Families of protocol 1 share their frames: a servo is listed under the one that knows its model.
@@ -154,8 +152,13 @@ class ServoState:
             voltage_V="voltage",
             temperature_degC="temperature",
         )
-        who = {"id": self.seen.id, "model": self.seen.model, "position": self.value("present_position")}
-        return {**who, **measured, **self.health()}
+        return {
+            "id": self.seen.id,
+            "model": self.seen.model,
+            "position": self.value("present_position"),
+            **measured,
+            **self.health(),
+        }
 
 
 def read_all(seen: FoundServo) -> ServoState:
@@ -172,7 +175,7 @@ def read_all(seen: FoundServo) -> ServoState:
 
 def samples(servos: Sequence[FoundServo], period_s: float, count: int | None = None) -> Iterator[list[Row]]:
     """Yield a row per servo (`watched`) every `period_s`, `count` times or without end."""
-    clock = servos[0].wire.clock
+    clock = servos[0].wire.port
     due_s = clock.now_s()
     for _ in range(count) if count is not None else itertools.count():
         clock.wait_until(due_s)
@@ -370,12 +373,12 @@ def _move_to(seen: FoundServo, role: str, raw: int, new_id: int | None = None, b
 
 def _wait_for(wire: Wire, servo: int) -> FoundServo | None:
     """Return the servo once it answers, within `BACK_S`; else None."""
-    end_s = wire.clock.now_s() + BACK_S
+    end_s = wire.port.now_s() + BACK_S
     while True:
         seen = wire.ping(servo, tries=1)
-        if seen is not None or wire.clock.now_s() >= end_s:
+        if seen is not None or wire.port.now_s() >= end_s:
             return seen
-        wire.clock.wait_until(wire.clock.now_s() + _STEP_S)
+        wire.port.wait_until(wire.port.now_s() + _STEP_S)
 
 
 # --- dump and restore -----------------------------------------------------------------------------------------------
@@ -402,9 +405,16 @@ def dump(servos: Sequence[FoundServo]) -> Dump:
     """Read every register of `servos`. Raises ConfigError for a model without a firmware map, ServoError."""
     found = []
     for seen in tracked(servos, "reading registers"):
-        who = {"id": seen.id, "model": seen.registers().model, "model_number": seen.model_number}
         seen.wire.at(seen.baud)
-        found.append(DumpedServo(**who, firmware=seen.firmware, registers=read_all(seen).values))
+        found.append(
+            DumpedServo(
+                id=seen.id,
+                model=seen.registers().model,
+                model_number=seen.model_number,
+                firmware=seen.firmware,
+                registers=read_all(seen).values,
+            )
+        )
     return Dump(servos=tuple(found))
 
 

@@ -22,7 +22,6 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.listen.report import failure
 from sfms_robot.app.open_head import build_motion, open_head
 from sfms_robot.app.options import HeadOptions, RunOptions
 from sfms_robot.app.session import drive_head, run, run_parts
@@ -135,9 +134,9 @@ def _delays(name: str, share: float, duration_s: float) -> tuple[Sequence[str], 
         chains = {bus: chain for bus, chain in opened.opened.items() if isinstance(chain, Chain)}
         seen = _Shafts(opened.config, chains, opened.clock)
         parts = run_parts(led, NobodyThere(), waves, observers=[seen])
-        report = drive_head(led, parts, Interrupt(), duration_s=duration_s)
-    if (error := failure(report)) is not None:
-        raise error
+        problem = drive_head(led, parts, Interrupt(), duration_s=duration_s)["error"]
+    if problem:
+        raise BusError(problem)
     times_s = np.array(seen.times_s)
     memory, meant = motion.retargeter.start(), []
     for face in waves.face(times_s):
