@@ -222,7 +222,10 @@ class FleetHead(Observer):
         session.declare_queryable(f"{key}/state", lambda query: query.reply(f"{key}/state", self._state_json()))
         session.declare_queryable(f"{key}/command", self._on_query)
         session.declare_subscriber(f"{key}/command", lambda sample: self._obey(sample.payload.to_bytes()))
-        session.declare_subscriber(f"{key}/halt", self._on_halt)
+        session.declare_subscriber(
+            f"{key}/halt",
+            lambda sample: self._controls.halt(sample.payload.to_bytes()[:_LONGEST_NAME].decode(errors="replace")),
+        )
         while True:
             over = self._over  # read first: the last state is sent after it
             session.put(f"{key}/state", self._state_json())
@@ -251,9 +254,6 @@ class FleetHead(Observer):
             if self._malformed == 1:
                 log.warning("fleet: %s/%s/command: %s (more are only counted)", ROOT, self._name, answer["error"])
         return answer
-
-    def _on_halt(self, sample: zenoh.Sample) -> None:
-        self._controls.halt(sample.payload.to_bytes()[:_LONGEST_NAME].decode(errors="replace"))
 
 
 # --- the other side -------------------------------------------------------------------------------------------------

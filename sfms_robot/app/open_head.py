@@ -92,8 +92,11 @@ class OpenHead:
 
     def digests(self) -> Report:
         """Return SHA-256 and count of the bytes on each emulated wire, by which runs are compared."""
-        digests = {name: chain.digest() for name, chain in self.opened.items() if isinstance(chain, Chain)}
-        return {name: {"sha256": sha256, "bytes": count} for name, (sha256, count) in digests.items()}
+        return {
+            name: dict(zip(("sha256", "bytes"), chain.digest(), strict=True))
+            for name, chain in self.opened.items()
+            if isinstance(chain, Chain)
+        }
 
 
 def doctor_command(head: str, port: str) -> str:
@@ -284,10 +287,10 @@ def build_bus(
     """
     buses: dict[str, Bus] = {}
     for name, where in opened.items():
-        joints = {key: joint for key, joint in head.joints.items() if joint.bus == name and key not in without}
+        joints = {key: joint for key, joint in head.on_bus(name).items() if key not in without}
         if joints:
             buses[name] = build_one(
-                head, name, joints, where, clock, confirmed=confirmed, doctor=doctor, kept={} if kept is None else kept
+                head, name, joints, where, clock, confirmed=confirmed, doctor=doctor, kept=kept or {}
             )
     real = not any(isinstance(where, Chain) and where.virtual for where in opened.values())
     rates = {name: head.buses[name].rate_hz for name in buses} if real and len(buses) > 1 else None

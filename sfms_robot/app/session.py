@@ -87,7 +87,7 @@ def drive_head(
         duration_s: None without an end.
         log: is filled; other threads may read it meanwhile.
     """
-    log = run_log(opened) if log is None else log
+    log = log or run_log(opened)
     real = not opened.options.fast
     outcome, error = "failed", None
     watched = parts.halt.watched(opened.bus) if real else nullcontext()
@@ -193,9 +193,12 @@ def run(
             watch(event_watch(outputs.event))
         recorder = None
         if options.record is not None:
-            about = run_facts(opened.config, options)
             recorder = Recorder(
-                options.record, joints, "wait" if options.fast else "drop", about, record_format=options.record_format
+                options.record,
+                joints,
+                "wait" if options.fast else "drop",
+                run_facts(opened.config, options),
+                record_format=options.record_format,
             )
             watch(recorder)
         if panel is not None:
@@ -214,10 +217,9 @@ def run(
         played: Report = {"timeline": timeline}
         if timeline is None:
             played = {"life": HeadLife(head.life, options.seed, head.camera), "answers": True}
-        overlay = controls.puppet.overlay
         parts = run_parts(
-            opened, person, feed, knobs=lambda: knobs.now, overlay=overlay, halt=halt, observers=watchers, **played,
-            missing=(lambda: outputs.missing) if outputs else tuple,
+            opened, person, feed, knobs=lambda: knobs.now, overlay=controls.puppet.overlay, halt=halt,
+            observers=watchers, missing=(lambda: outputs.missing) if outputs else tuple, **played,
         )  # fmt: skip
         report = drive_head(opened, parts, interrupt, duration_s=duration_s, log=log)
         status.ended(log.states[-1][1])

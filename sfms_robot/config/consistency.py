@@ -49,7 +49,7 @@ def highest_rate_hz(family: str, baud: int, joints: int) -> float:
 def _rates(head: Any) -> Iterator[str]:
     """Yield the buses whose packets, or whose wire at `rate_hz`, cannot carry the goals of their joints."""
     for name, bus in head.buses.items():
-        count = sum(joint.bus == name for joint in head.joints.values())
+        count = len(head.on_bus(name))
         framing = FRAMINGS.get(bus.family)  # None for a family of another package
         longest = framing.longest if framing else 0  # 0: a board, which has no packet of all goals
         most = (longest - framing.write) // (framing.write_each + framing.goal) if framing and longest else count

@@ -197,6 +197,10 @@ class Head(Model):
         """(J,) angles at rest."""
         return np.array([joint.rest_rad for joint in self.joints.values()])
 
+    def on_bus(self, bus: str) -> dict[str, Joint]:
+        """Return the joints of one bus, by name."""
+        return {name: joint for name, joint in self.joints.items() if joint.bus == bus}
+
     def safety_of(self, joint: str) -> Safety:
         return self.safety.merged(self.joints[joint].safety)
 

@@ -173,10 +173,6 @@ class Table:
         code = self.role("baud_rate")
         return self.baud_codes.get(code.initial) if code else None
 
-    def span(self, names: Sequence[str]) -> tuple[int, int]:
-        """Return (address, length) of the block that holds all of `names`."""
-        return span_of([self.fields[name] for name in names])
-
     @property
     def servo_faults(self) -> Mapping[int, str]:
         """Return bit -> fault of the servo: of its error status (Protocol 2.0), or of every status packet."""

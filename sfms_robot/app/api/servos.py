@@ -49,11 +49,9 @@ class Background(Observer):
         interrupt: ends it; `halt`: emergency stop.
     """
 
-    def __init__(
-        self, work: Callable[[Background], Report], interrupt: Interrupt | None = None, halt: HaltLatch | None = None
-    ) -> None:
+    def __init__(self, work: Callable[[Background], Report], interrupt: Interrupt, halt: HaltLatch) -> None:
         self._work = work
-        self.interrupt, self.halt = interrupt or Interrupt(), halt or HaltLatch()
+        self.interrupt, self.halt = interrupt, halt
         self._thread = threading.Thread(target=self._run, name="robot", daemon=True)
         self._error: Exception | None = None
         self._raised = False
@@ -222,7 +220,6 @@ class Servos(Driven):
     def __init__(self, options: HeadOptions) -> None:
         self._options = options
         self._stack = ExitStack()
-        self._target = _Target(np.zeros(0))
 
     def __enter__(self) -> Self:
         """Connect. Blocks while the servos are identified; torque stays as found. Raises RobotError."""
@@ -248,7 +245,7 @@ class Servos(Driven):
         stands = [readings[joint].position_rad if joint in readings else None for joint in self.joints]
         found = [rest if at is None else at for at, rest in zip(stands, self.rest_rad.tolist(), strict=True)]
         self._target = _Target(np.clip(found, self.low_rad, self.high_rad), self.joints)
-        self._run = Background(self._drive)
+        self._run = Background(self._drive, Interrupt(), HaltLatch())
         self._run.start()
 
     def write(self, angles_rad: ArrayLike) -> None:
@@ -312,7 +309,7 @@ class Servos(Driven):
 class _Target:
     """A `Retargeter` that returns the angles (J,) written last, for every face."""
 
-    def __init__(self, angles_rad: Doubles, joints: Sequence[str] = ()) -> None:
+    def __init__(self, angles_rad: Doubles, joints: Sequence[str]) -> None:
         self.angles_rad = angles_rad
         self.joints = joints
 

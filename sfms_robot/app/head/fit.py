@@ -59,9 +59,7 @@ _SIZE_PRICE: Final = 0.01  # for shapes that hardly move the skin
 # --- babble -----------------------------------------------------------------------------------------------------------
 
 
-def babble(
-    options: HeadOptions, record: Path, *, minutes: float = 2.0, seed: int = 0, panel: Panel | None = None
-) -> Report:
+def babble(options: HeadOptions, record: Path, *, minutes: float, seed: int, panel: Panel | None = None) -> Report:
     """Move, and record the run in a folder. Block until then; return its report.
 
     Raises RobotError, the head at rest; ConfigError before it moves where the fit could not be written.

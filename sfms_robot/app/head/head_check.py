@@ -167,7 +167,7 @@ def _channels(head: Head, retargeter: HeadRetargeter) -> dict[str, Sequence[str]
     neck, kinematics = retargeter.neck, head.kinematics
     if neck is not None and kinematics is not None:
         for name in neck.joints:
-            found[name] = [axis for axis in neck.axes if name in kinematics.joints_of(axis)]
+            found[name] = tuple(axis for axis in neck.axes if name in kinematics.joints_of(axis))
     return found
 
 

@@ -39,14 +39,11 @@ _BOUNDS: Final = {"roll": 1.0, "pitch": 1.0, "yaw": 1.6, "x": 0.1, "y": 0.1, "z"
 def expressions() -> Mapping[str, Mapping[str, float]]:
     """Return the channels of the faces of configs/expressions.yaml, by name. Raises ConfigError."""
     faces = read(data_dir("configs") / "expressions.yaml")
+    sides = dict.fromkeys(CHANNEL_INDEX, ("",))
     return {
-        face: {f"{name}{side}": value for name, value in given.items() for side in _sides(name)}
+        face: {f"{name}{side}": value for name, value in given.items() for side in sides.get(name, ("Left", "Right"))}
         for face, given in faces.items()
     }
-
-
-def _sides(name: str) -> Sequence[str]:
-    return ("",) if name in CHANNEL_INDEX else ("Left", "Right")
 
 
 def parse_face(words: Sequence[str]) -> Floats:

@@ -36,7 +36,7 @@ def demo(
     person talks meanwhile, then the next. Further runs are not recorded. Without the packages that a picture needs, it
     is left out and `"missing"` names the pip install. `folder` None: a new one, `FOLDER` or the next free number.
     """
-    folder = folder if folder is not None else free_folder(FOLDER)
+    folder = folder or free_folder(FOLDER)
     options = replace(options, audio=DEFAULT_SPEAKER, face=FACE, record=folder)
     seen = False
     if page is None:

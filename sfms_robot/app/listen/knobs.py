@@ -10,8 +10,7 @@ from sfms_robot.app.options import RunOptions, values_by_name
 from sfms_robot.config import Calmness, Head, parse
 from sfms_robot.errors import InputError
 from sfms_robot.ports import Facts
-from sfms_robot.retarget.channel_mapping import ChannelMapping as Face
-from sfms_robot.retarget.channel_mapping import Knobs
+from sfms_robot.retarget.channel_mapping import ChannelMapping, Knobs
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
 from sfms_robot.runtime.halt import HaltLatch
@@ -65,7 +64,7 @@ class LiveKnobs:
     """
 
     def __init__(self, head: Head, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
-        self._face = Face(head)
+        self._face = ChannelMapping(head)
         self._lock = RLock()
         self.values: dict[str, dict[str, float]] = {
             kind: {name: float(getattr(region, kind)) for name, region in head.regions.items()}

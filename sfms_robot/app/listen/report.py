@@ -57,14 +57,10 @@ def run_report(
         "exit": outcome,
         "exit_code": INTERRUPTED if outcome == "interrupted" else code,
         "error": None if error is None else str(error),
-        "torque_unconfirmed": log.torque_unconfirmed,
         "listener": "none",
         "seed": 0,
         "duration_s": round(log.listened_s, 4),
-        "frames": log.frames,
-        "ticks": log.ticks,
-        "tick": log.tick_report(opened.rate_hz, elapsed_s),
-        "latency_ms": _latency(log, elapsed_s is not None),
+        **_loop_figures(opened, log, elapsed_s),
         "listener_step_ms": heard.pop("step_ms"),
         "hop": heard.pop("hop", None),
         "budget_ms": heard.pop("budget_ms", None),
@@ -101,13 +97,9 @@ def figures_so_far(
     more: Callable[[], Facts],
 ) -> Report:
     """Return the figures of the report that are known while it runs, under the report's names. From any thread."""
-    real = not opened.options.fast
+    passed_s = log.listened_s + (1 + log.eased) * log.period_s
     return {
-        "torque_unconfirmed": log.torque_unconfirmed,
-        "frames": log.frames,
-        "ticks": log.ticks,
-        "tick": log.tick_report(opened.rate_hz, log.listened_s + (1 + log.eased) * log.period_s if real else None),
-        "latency_ms": _latency(log, real),
+        **_loop_figures(opened, log, None if opened.options.fast else passed_s),
         "motion": log.motion_so_far(),
         "source": dict(person.statistics()),
         "listener_state": dict(feed.statistics()),
@@ -117,10 +109,17 @@ def figures_so_far(
     }
 
 
-def _latency(log: RunLog, real: bool) -> Report:
+def _loop_figures(opened: OpenHead, log: RunLog, elapsed_s: float | None) -> Report:
+    real = elapsed_s is not None
     return {
-        "frame_to_wire": log.frame_to_wire_ms.report(p50=50, p99=99) if real else {"p50": None, "p99": None},
-        "speech_to_wire": log.speech_to_wire_ms.report(p50=50, p95=95) if real else {"p50": None, "p95": None},
+        "torque_unconfirmed": log.torque_unconfirmed,
+        "frames": log.frames,
+        "ticks": log.ticks,
+        "tick": log.tick_report(opened.rate_hz, elapsed_s),
+        "latency_ms": {
+            "frame_to_wire": log.frame_to_wire_ms.report(p50=50, p99=99) if real else {"p50": None, "p99": None},
+            "speech_to_wire": log.speech_to_wire_ms.report(p50=50, p95=95) if real else {"p50": None, "p95": None},
+        },
     }
 
 
@@ -137,7 +136,7 @@ def run_facts(head: Head, options: RunOptions) -> dict[str, str]:
     `head_yaml` is the head as it was used, calibration included, and a head's file itself. Of a listener that is a
     folder there are its configuration and the SHA-256 of its weights.
     """
-    calmness = None if options.calmness is None else options.calmness.model_dump(exclude_none=True)
+    calmness = options.calmness and options.calmness.model_dump(exclude_none=True)
     values = {**asdict(options), "audio": options.hears, "calmness": calmness}
     given = {name: value for name, value in values.items() if value not in (None, (), False)}
     return {

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -60,17 +61,18 @@ _STATES: Final = {
 _EVENTS: Final = {"nod": "v", "blink": "|", "smile": "^"}
 _LEAST_LABEL: Final = 0.04  # of the width: a state that is shorter has its color alone
 
-# Signals of a face: channels added, channels taken off. The plot has a lane for each of the first six.
-_SIGNALS: Final[dict[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
-    "blink": (("eyeBlinkLeft", "eyeBlinkRight"), ()),
-    "squint": (("eyeSquintLeft", "eyeSquintRight"), ()),
-    "gaze left +": (("eyeLookOutLeft", "eyeLookInRight"), ("eyeLookInLeft", "eyeLookOutRight")),
-    "brow inner up": (("browInnerUp",), ()),
-    "smile": (("mouthSmileLeft", "mouthSmileRight"), ()),
-    "jaw open": (("jawOpen",), ()),
-    "turn": (("yaw",), ()),
-    "tilt": (("roll",), ()),
+# Signals of a face: the mean of channels, less the mean of others. The plot has a lane for each of the first six.
+_SIGNALS: Final[dict[str, Sequence[str]]] = {
+    "blink": ("eyeBlinkLeft", "eyeBlinkRight"),
+    "squint": ("eyeSquintLeft", "eyeSquintRight"),
+    "gaze left +": ("eyeLookOutLeft", "eyeLookInRight"),
+    "brow inner up": ("browInnerUp",),
+    "smile": ("mouthSmileLeft", "mouthSmileRight"),
+    "jaw open": ("jawOpen",),
+    "turn": ("yaw",),
+    "tilt": ("roll",),
 }
+_LESS: Final[dict[str, Sequence[str]]] = {"gaze left +": ("eyeLookInLeft", "eyeLookOutRight")}
 _LANES: Final = list(_SIGNALS)[:6]
 # What a sheet writes below an instant: signal, direction, the least that counts (rad for turn and tilt), label.
 _LABELS: Final = (
@@ -124,8 +126,7 @@ def plot(recording: RunRecording, png: Path) -> None:
 
 def _states(axes: Axes, recording: RunRecording) -> None:
     """Draw the states of the run as a band, and on it the planned events."""
-    ends_s = [*(since_s for since_s, _, _ in recording.states[1:]), recording.duration_s]
-    for (since_s, name, why), end_s in zip(recording.states, ends_s, strict=False):
+    for (since_s, name, why), (end_s, _, _) in pairwise([*recording.states, (recording.duration_s, "", ())]):
         axes.axvspan(since_s, end_s, color=_STATES.get(name, FAINT), lw=0)
         if end_s - since_s > _LEAST_LABEL * recording.duration_s:
             text = f"{name}: {', '.join(why)}" if why else name
@@ -169,7 +170,7 @@ def _lanes(axes: Axes, recording: RunRecording) -> None:
     lanes = len(_LANES)
     for lane, (name, color) in enumerate(zip(_LANES, _COLORS, strict=True)):
         base = float(lanes - 1 - lane)
-        value, middle = _signal(recording.motion, name), 0.5 if _SIGNALS[name][1] else 0.0
+        value, middle = _signal(recording.motion, name), 0.5 if name in _LESS else 0.0
         curve = base + 0.84 * (middle + (1 - middle) * value)
         axes.fill_between(recording.times_s, base + 0.84 * middle, curve, color=color, alpha=0.35, lw=0)
         axes.plot(recording.times_s, curve, color=color, lw=1.2)
@@ -254,7 +255,7 @@ def pick_instants(times_s: Doubles, motion: Floats) -> dict[int, str]:
 
 def _signal(motion: Floats, name: str) -> Floats:
     """Return a signal (N,) of `_SIGNALS`."""
-    plus, minus = ([CHANNEL_INDEX[channel] for channel in channels] for channels in _SIGNALS[name])
+    plus, minus = ([CHANNEL_INDEX[channel] for channel in each] for each in (_SIGNALS[name], _LESS.get(name, ())))
     value: Floats = motion[:, plus].mean(axis=1)
     return value - motion[:, minus].mean(axis=1) if minus else value
 

@@ -33,7 +33,6 @@ from sfms_robot.listeners.capacity import GPU_SIZES, SIZES, measure_capacity
 from sfms_robot.listeners.engine import Device, EngineName
 from sfms_robot.listeners.process import plan_times_s
 from sfms_robot.listeners.stream_server import StreamServer
-from sfms_robot.ports import Listener
 from sfms_robot.processes import ParentPipe
 
 LEAD_S: Final = 0.080  # longest lead of a joint, for the hop that a robot would choose
@@ -74,12 +73,22 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # of a service manager that stops all processes: the parent ends this
     parent.forward(inbox.put)
     try:
-        listener = _loaded(served)
-        parent.send(("loaded", listener.hop))
-        hop = inbox.get()
-        from sfms_robot.listeners.registry import at_hop
+        from sfms_robot.listeners.registry import at_hop, hops_of, load_listener
 
-        listener = at_hop(listener, hop)
+        listener = load_listener(served.listener, engine=served.engine, threads=1, device=served.device)
+        hops, hop = hops_of(listener), served.hop
+        if hop is None:
+            p50_s, p99_s = plan_times_s(at_hop(listener, min(hops)))
+            latencies = Latencies(
+                horizon=listener.horizon, source_s=0.0, step_p50_s=p50_s, step_p99_s=p99_s, lead_s=LEAD_S, tick_s=TICK_S
+            )
+            hop = choose_hop(hops, latencies).hop
+        elif hop not in hops:
+            raise ConfigError(
+                f"--hop {hop}: not a hop of listener {served.listener!r} (valid: {', '.join(map(str, hops))})"
+            )
+        parent.send(("loaded", hop))
+        listener = at_hop(listener, inbox.get())
         capacity = measure_capacity(listener, SIZES if served.device == "cpu" else GPU_SIZES)
     except (RobotError, MemoryError) as error:
         parent.send(("error", error if isinstance(error, RobotError) else ModelError(f"{served.listener}: {error}")))
@@ -87,30 +96,6 @@ def main() -> None:
     parent.send(("ready", capacity))
     server = StreamServer(listener, served.name, None if served.all_heads else capacity, served.server)
     _serve(server, inbox, parent.send)
-
-
-def _loaded(served: Served) -> Listener:
-    """Return the listener at the hop it would be served with; blocks for seconds. Raises ConfigError, ModelError."""
-    from sfms_robot.listeners.registry import at_hop, hops_of, load_listener
-
-    listener = load_listener(served.listener, engine=served.engine, threads=1, device=served.device)
-    hops = hops_of(listener)
-    if served.hop is not None:
-        if served.hop not in hops:
-            raise ConfigError(
-                f"--hop {served.hop}: not a hop of listener {served.listener!r} (valid: {', '.join(map(str, hops))})"
-            )
-        return at_hop(listener, served.hop)
-    p50_s, p99_s = plan_times_s(at_hop(listener, min(hops)))
-    return at_hop(
-        listener,
-        choose_hop(
-            hops,
-            Latencies(
-                horizon=listener.horizon, source_s=0.0, step_p50_s=p50_s, step_p99_s=p99_s, lead_s=LEAD_S, tick_s=TICK_S
-            ),
-        ).hop,
-    )
 
 
 def _serve(server: StreamServer, inbox: queue.SimpleQueue[Any], say: Say) -> None:

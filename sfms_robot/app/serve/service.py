@@ -192,8 +192,9 @@ class WorkerPool:
         if self._closing:
             return
         if worker.capacity is None:
-            error = ModelError(f"{self._served.listener}: a process of the server ended with exit code {code} at once")
-            self.problem = self.problem or error
+            self.problem = self.problem or ModelError(
+                f"{self._served.listener}: a process of the server ended with exit code {code} at once"
+            )
             return
         log.error("a process of the server ended with exit code %d: %d heads join again", code, len(worker.clients))
         self._workers[self._workers.index(worker)] = _Worker(self._served, self._take)

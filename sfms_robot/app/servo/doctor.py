@@ -54,7 +54,7 @@ from sfms_robot.servo.chain.startup import needs_of
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports, rivals
 from sfms_robot.servo.families import family_named
 from sfms_robot.servo.port import Port, SerialPort
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.registers import Table, span_of
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
 DEFAULT_HEAD: Final = "face28"  # whose servos are emulated
@@ -123,13 +123,17 @@ def examine_line(
         report["adapter"] = asdict(adapter)
         try:
             if family_named(line.family).board:
-                found, facts = _look_at_board(line, port, adapter)
+                table = Table.of(load_firmware_map(next(iter(line.wanted.values())).model))
+                wire = RateLimitedPort(port, line.first_baud, _BOARD_S)
+                problem = board_problem(table, board_for(table, line.crc), wire)
+                budget = wire_budget(line.family, len(line.wanted), line.first_baud, crc=line.crc)
+                found = [*judge_board(line.family, len(line.wanted), problem, adapter), *judge_rate(budget, line)]
+                facts = {"baud": line.first_baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": budget}
             else:
                 found, facts = _look(line, Wire(port, line.family, line.first_baud), adapter, progress, fix)
+            report |= {**facts, "udev_rule": udev_rule(adapter)}
         except (BusError, PacketError, ServoError) as error:
             found = [Finding("error", path, str(error).removeprefix(f"{path}: "), "check plug and cable")]
-        else:
-            report |= {**facts, "udev_rule": udev_rule(adapter)}
     return _finished(report, [*judge_adapter(adapter, held_by), *others, *found])
 
 
@@ -165,7 +169,7 @@ def _lines(
         open_port: OpenPort = partial(SerialPort, device, bus.baud, clock, bus.rs485)
         if not isinstance(each, str):
             open_port = port_of(each, bus, clock)
-        joints = {key: joint for key, joint in described.joints.items() if joint.bus == name}
+        joints = described.on_bus(name)
         servos = bus_servos(described, joints)
         line = Line(
             device=device,
@@ -231,7 +235,7 @@ def _look(
             baud,
             return_delay_us=max(state.in_unit("return_delay") or 0.0 for state in members),
             latency_ms=0.0 if line.is_terminal else _USB_MS if adapter.latency_ms is None else adapter.latency_ms,
-            read_bytes=table.span([field.name for role in _READ if (field := table.role(role)) is not None])[1],
+            read_bytes=span_of([field for role in _READ if (field := table.role(role)) is not None])[1],
             write_bytes=goal.size if goal else 2,
             together=table.byte_order == "little",
         )
@@ -328,16 +332,3 @@ def _servo_row(state: ServoState, line: Line) -> Row:
     measured = state.measured(1, voltage_V="voltage", temperature_degC="temperature", return_delay_us="return_delay")
     row = {key: value for key, value in state.seen.row().items() if key != "family"}  # the bus has it
     return {**row, "joint": want and want.joint, **measured, **state.health()}
-
-
-# --- a board of hobby servos ----------------------------------------------------------------------------------------
-
-
-def _look_at_board(line: Line, port: Port, adapter: SerialDevice) -> tuple[list[Finding], Report]:
-    """Return what can be said of a board, whose port could be opened."""
-    budget = wire_budget(line.family, max(1, len(line.wanted)), line.first_baud, crc=line.crc)
-    table = Table.of(load_firmware_map(next(iter(line.wanted.values())).model))
-    wire = RateLimitedPort(port, line.first_baud, _BOARD_S)
-    problem = board_problem(table, board_for(table, line.crc), wire)
-    findings = [*judge_board(line.family, len(line.wanted), problem, adapter), *judge_rate(budget, line)]
-    return findings, {"baud": line.first_baud, "rate_hz": line.rate_hz, "fast_sync_read": None, "budget": budget}

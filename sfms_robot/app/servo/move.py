@@ -95,7 +95,7 @@ def _target(seen: FoundServo, limits: tuple[int, int], start: int, to: str | Non
     if (to is None) == (by is None):
         raise ConfigError("servo move: say --to TICKS or --by TICKS, one of them (or degrees: --by -5deg)")
     text = to if to is not None else by or ""
-    number, unit = parse_number(text) or ("", "")
+    number, unit = parse_number(text)
     if not number or unit not in ("", "deg"):
         raise ConfigError.at("servo move", "goal", text, "is not a place", ["ticks: 2048", "degrees: 12.5deg"])
     ticks = round(_ticks(seen.registers(), float(number))) if unit else int(number)
@@ -164,7 +164,7 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
     rows: list[Row] = []
     failures: list[RobotError] = []
     for name, where in opened.items():
-        joints = {key: joint for key, joint in head.joints.items() if joint.bus == name}
+        joints = head.on_bus(name)
         bus, servos = head.buses[name], bus_servos(head, joints)
         names, tables = {each.id: each.joint for each in servos}, {each.id: each.table for each in servos}
         try:

@@ -161,7 +161,7 @@ class Wire:
         self.baud = baud
         self.link = self._link(baud)
         which = "" if family == "dynamixel2" else f" --family {family}"
-        self._place = f"--port {quote(port.name)}{which}" if place is None else place
+        self._place = place or f"--port {quote(port.name)}{which}"
 
     def command(self, words: str) -> str:
         """Return a `servo` command for this wire."""

@@ -22,7 +22,7 @@ from sfms_robot.config.base import Model
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT
-from sfms_robot.servo.registers import Field
+from sfms_robot.servo.registers import Field, span_of
 
 BACK_S: Final = 2.0  # a servo that restarts is back by then
 _STEP_S: Final = 0.1
@@ -185,10 +185,10 @@ def samples(servos: Sequence[FoundServo], period_s: float, count: int | None = N
 
 def watched(seen: FoundServo) -> Row:
     """Return the row of `servo monitor`: position and health; `silent` for a servo that does not answer."""
-    names = [field.name for role in _WATCHED if seen.table and (field := seen.table.role(role)) is not None]
-    if seen.table is None or not names:
+    fields = [field for role in _WATCHED if seen.table and (field := seen.table.role(role)) is not None]
+    if not fields:
         return ServoState(seen, {}).row() | {"faults": "no firmware map"}
-    start, length = seen.table.span(names)
+    start, length = span_of(fields)
     answer = seen.wire.at(seen.baud).read(seen.id, start, length)
     if answer is None or seen.wire.link.refusal(answer):
         return ServoState(seen, {}).row() | {"faults": "silent"}
@@ -248,7 +248,7 @@ def write_register(seen: FoundServo, name: str, text: str, confirm: Confirm) -> 
 
 def parse_value(model: str, field: Field, text: str) -> int:
     """Return the raw value of a number, or of one with the register's unit. Raises ConfigError outside its range."""
-    number, unit = parse_number(text) or ("", "")
+    number, unit = parse_number(text)
     if not number or (unit and unit != field.unit):
         forms = ["a raw number", *([f"a number with unit {field.unit}"] if field.unit else [])]
         raise ConfigError.at(model, field.name, text, "is not a value of this register", forms)
@@ -258,10 +258,10 @@ def parse_value(model: str, field: Field, text: str) -> int:
     return raw
 
 
-def parse_number(text: str) -> tuple[str, str] | None:
-    """Split `12.5deg` into number and unit; None for text that is neither that nor a whole number without a unit."""
+def parse_number(text: str) -> tuple[str, str]:
+    """Split `12.5deg` into number and unit; two empty texts for what is neither that nor a whole number alone."""
     match = re.fullmatch(r"\s*([-+]?\d{1,20}(?:\.\d+)?)\s*([A-Za-z_]\w*)?\s*", text)
-    return None if match is None or (not match[2] and "." in match[1]) else (match[1], match[2] or "")
+    return ("", "") if match is None or (not match[2] and "." in match[1]) else (match[1], match[2] or "")
 
 
 # --- id, rate, start over ---------------------------------------------------------------------------------------
