@@ -333,7 +333,7 @@ class Fleet:
             log.warning("fleet: %s: expected a JSON document of a head (more are only counted)", sample.key_expr)
 
 
-def tile(name: str, document: Facts, age_s: float = 0.0) -> dict[str, Any]:
+def tile(name: str, document: Facts, age_s: float = 0.0) -> Facts:
     """Return a summary of a head; `here` False: without news for `GONE_S`, or it has ended."""
     state = str(document.get("state", "?"))
     return {

@@ -111,8 +111,7 @@ def examine_line(
     report |= {"adapter": None, "udev_rule": None, "servos": [], "budget": None, "fixed": []}
     others = [Finding("warning", path, trouble, cure) for trouble, cure in rivals(path)]
     if problem is not None:
-        failed = judge_port(path, problem, group_of(path), list_ports())
-        return _finished(report, [failed, *others], PORT_FAILED)
+        return _finished(report, [judge_port(path, problem, group_of(path), list_ports()), *others], PORT_FAILED)
     held_by = [] if line.is_terminal else holders(path)
     try:
         port = open_port()
@@ -203,8 +202,7 @@ def _look(
 ) -> tuple[list[Finding], Report]:
     """Return findings and facts that need the open port."""
     baud, found = _present(wire, line, progress)
-    hint = "" if found else protocol_hint(other_wires(wire))
-    findings = list(judge_presence(line, found, baud, hint))
+    findings = list(judge_presence(line, found, baud, "" if found else protocol_hint(other_wires(wire))))
     fixed: list[str] = []
     states: list[ServoState] = []
     for done, seen in enumerate(found):

@@ -14,8 +14,9 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final
+from typing import Final
 
+from sfms_robot.app.options import Report
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.emulator.launch import BehindSilent, Chain, EmulatedServo, Timing, launch, wait
@@ -49,9 +50,8 @@ def emulators(
 
     The arguments are the options of `cli.emulate_command`. Raises ConfigError, BusError.
     """
-    settings: dict[str, Any] = {
-        key: value for key, value in (("baud", baud), ("supply_v", voltage)) if value is not None
-    }
+    given: Report = {"baud": baud, "supply_v": voltage}
+    settings = {key: value for key, value in given.items() if value is not None}
     if (head is None) == (servo is None):
         raise ConfigError("emulate needs either --head NAME or --servo MODEL:IDS[,MODEL:IDS...]")
     if head is not None:
@@ -82,7 +82,7 @@ def emulators(
         yield chains
 
 
-def described(chains: Mapping[str, Chain], head: str | None) -> dict[str, Any]:
+def described(chains: Mapping[str, Chain], head: str | None) -> Report:
     """Return the devices and their servos as plain data for `--json`."""
     joints = {} if head is None else {(j.bus, j.id): name for name, j in load_head(head).joints.items()}
     buses = {}
