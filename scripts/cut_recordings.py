@@ -19,9 +19,9 @@ from scipy import signal
 
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, SHAPES, Floats
 from sfms_robot.lab.corpora.clips import TAKE_STEP, Split
+from sfms_robot.lab.corpora.collection import columns
 from sfms_robot.lab.corpora.compose.motions import SHAPE, edges, slow
 from sfms_robot.lab.corpora.compose.voices import at_25_hz, facegood_mouth
-from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.signals.motion_primitives import STEP
 from sfms_robot.signals.tracks import Take, face_stretches, read_track, resample, stretches
 

@@ -24,8 +24,9 @@ def made_dyad(listener: np.ndarray, **changes) -> Dyad:
 
 def meeting_person(**changes) -> MeetingPerson:
     """One to whom nothing happens in a meeting of five minutes, and who does nothing."""
-    spans = ("nods", "shakes", "tilts", "unseen", "laughs", "talk", "backchannels", "others", "others_laughs")
+    spans = "nods shakes tilts unseen laughs mm_hms talk backchannels others others_laughs others_backchannels".split()
     whole = {
+        "others_nods": (), "looked_at": (), "gaze_known": frozenset(), "words": {},
         "meeting": "M1a", "agent": "B", "participant": "P1", "until_s": 300.0, "gaze": None, "floor": (),
         "asked": np.zeros(0),
     }  # fmt: skip

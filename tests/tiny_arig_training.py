@@ -8,7 +8,6 @@ from sfms_robot import config
 from sfms_robot.config import parse_training
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES, ListenerEvent
 from sfms_robot.lab.corpora import clips
-from sfms_robot.lab.corpora import conversational_states as labels
 
 HZ = 25
 TINY = {
@@ -44,7 +43,7 @@ def dyad(name: str, scene: str, seed: int) -> clips.Dyad:
     motion[:, CHANNEL_INDEX["jawOpen"]] = 0.4 * agent
     motion[:, CHANNEL_INDEX["pitch"]] = 0.05 * np.sin(np.arange(frames) / 3) * user
     face = motion[::-1].copy() if scene != "speaking" else np.full((frames, 58), np.nan, np.float32)
-    states = labels.label(labels.of_activity(agent, user))
+    states = clips.states_of_activity(agent, user)
     return clips.Dyad(
         name=name,
         audio=voice(user),

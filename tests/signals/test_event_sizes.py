@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sfms_robot.data import data_dir
+from sfms_robot.frames import ListenerEvent
 from sfms_robot.lab.corpora.compose import render_events
 from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals.motion_primitives import read_motions
@@ -29,6 +30,6 @@ def test_a_swing_is_never_faster_nor_slower_than_a_neck_goes(length_s):
 def test_a_swing_reaches_as_far_as_recorded_ones_do_in_that_time():
     nods = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"].nods
     for swing_s in sizes.SWING_REACH[0]:
-        manner = render_events.NodManner(np.deg2rad(sizes.NOD_DEG[2]), 1, swing_s, 1.0)
-        reached = np.median([np.ptp(render_events.nod_curve(manner, shape, 0.4, 50)) for shape in nods])
+        nod = ListenerEvent("nod", 0.4, swing_s, np.deg2rad(sizes.NOD_DEG[2]))
+        reached = np.median([np.ptp(render_events.nod_curve(nod, 1.0, shape, 50)) for shape in nods])
         assert np.degrees(sizes.swing_reach_rad(swing_s)) == pytest.approx(np.degrees(reached), rel=0.1)

@@ -14,6 +14,7 @@ from typing import Any, Final, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import (
     AUDIO_HZ,
@@ -21,11 +22,13 @@ from sfms_robot.frames import (
     FRAME_HZ,
     MOTION_DIM,
     SPACE_CHANNELS,
+    Bools,
     Doubles,
     Floats,
     ListenerEvent,
 )
 from sfms_robot.signals import mel as log_mel
+from sfms_robot.signals.events import runs
 from sfms_robot.signals.face_tables import SHAPES_OF_UNIT
 from sfms_robot.signals.tracks import Take
 
@@ -62,7 +65,8 @@ _EVENT: Final = np.dtype(
     [(name, "f8") for name in ("start_s", "duration_s", "size")]
     + [("kind", "U16"), ("swings", "i4"), ("target_rad", "f8", 2)]
 )
-# Arrays that a dyad may lack: their type on disk, and as they are read.
+_VOICES: Final = ("audio", "agent_audio")
+# Other arrays that a dyad may lack: their type on disk, and as they are read.
 _OPTIONAL: Final[Mapping[str, tuple[type, type]]] = {
     "states": (np.int8, np.int8),
     "mel": (np.float32, np.float32),
@@ -114,17 +118,18 @@ class Dyad:
             raise ValueError(f"{self.name}: motion space {self.space!r} is not known ({', '.join(WIDTHS)})")
         if not self.fps > 0:
             raise ValueError(f"{self.name}: fps {self.fps:g} must be above 0")
-        frames, width = len(self.listener), WIDTHS[self.space]
+        frames = len(self.listener)
+        sound, motion, each = (samples_of(frames, self.fps),), (frames, WIDTHS[self.space]), (frames,)
         expected: dict[str, tuple[int, ...]] = {
-            "audio": (samples_of(frames, self.fps),),
-            "speaker": (frames, width),
-            "listener": (frames, width),
-            "listening": (frames,),
+            "audio": sound,
+            "speaker": motion,
+            "listener": motion,
+            "listening": each,
             "mel": (log_mel.ROWS_PER_FRAME * frames, log_mel.MEL_BINS),
-            "agent_audio": (samples_of(frames, self.fps),),
-            "states": (frames,),
+            "agent_audio": sound,
+            "states": each,
             "head_of_gaze_rad": (frames, 3),
-            "attention": (frames,),
+            "attention": each,
         }
         for key, shape in expected.items():
             if (values := getattr(self, key)) is not None and values.shape != shape:
@@ -184,8 +189,8 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
             "listener": dyad.listener.astype(kind),
             "listening": dyad.listening,
         }
-        for key, voice in (("audio", dyad.audio), ("agent_audio", dyad.agent_audio)):
-            if voice is not None:
+        for key in _VOICES:
+            if (voice := getattr(dyad, key)) is not None:
                 arrays[key] = np.round(voice * 32767).astype(np.int16)
         for key, (filed, _) in _OPTIONAL.items():
             if (values := getattr(dyad, key)) is not None:
@@ -198,14 +203,6 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
         np.savez_compressed(folder / f"{dyad.name}.npz", **arrays)  # type: ignore[arg-type]
 
 
-def load(folder: Path) -> list[Dyad]:
-    """Return every dyad in a folder, by name. Raises ConfigError when there is none or one is broken."""
-    files = sorted(folder.glob("*.npz"))
-    if not files:
-        raise ConfigError(f"{folder}: no dyads (*.npz) here; `sfms-robot data compose` makes them")
-    return [read(file) for file in files]
-
-
 def read(file: Path) -> Dyad:
     """Return one dyad as `save` wrote it. Raises ConfigError."""
     try:
@@ -213,16 +210,17 @@ def read(file: Path) -> Dyad:
             optional: dict[str, Any] = {
                 key: arrays[key].astype(read) for key, (_, read) in _OPTIONAL.items() if key in arrays
             }
+            voices = {key: arrays[key].astype(np.float32) / 32767 for key in _VOICES if key in arrays}
             if "space" in arrays:
                 optional |= {"space": str(arrays["space"]), "fps": float(arrays["fps"])}
             return Dyad(
                 name=file.stem,
-                audio=_voice(arrays, "audio"),
+                audio=voices.get("audio"),
                 speaker=arrays["speaker"].astype(np.float32),
                 listener=arrays["listener"].astype(np.float32),
                 listening=arrays["listening"].astype(bool),
                 features={key.removeprefix(FEATURE): arrays[key] for key in arrays if key.startswith(FEATURE)},
-                agent_audio=_voice(arrays, "agent_audio"),
+                agent_audio=voices.get("agent_audio"),
                 events=_events(arrays["events"]) if "events" in arrays else None,
                 **optional,
             )
@@ -265,10 +263,6 @@ def _events(rows: NDArray[np.void]) -> tuple[ListenerEvent, ...]:
         )
         for start_s, duration_s, size, kind, swings, target in rows.astype(_EVENT).tolist()
     )
-
-
-def _voice(arrays: Mapping[str, NDArray[Any]], key: str) -> Floats | None:
-    return np.asarray(arrays[key].astype(np.float32) / 32767, np.float32) if key in arrays else None
 
 
 # --- Splits: one table for composing, fitting and scoring -----------------------------------------------------------
@@ -322,12 +316,72 @@ def by_split(items: Iterable[tuple[Split, _Item]]) -> dict[Split, list[_Item]]:
 
 
 def blendshapes_of(intensities: Floats | Doubles) -> Floats:
-    """Return blendshapes (N, 52) within 0..1 of intensities (N, 24) in the order of `FAU_VALUE`.
-
-    Raises ValueError for another width."""
-    if intensities.ndim != 2 or intensities.shape[1] != len(FAU_VALUE):
-        raise ValueError(f"action units are {intensities.shape}, not (N, {len(FAU_VALUE)})")
+    """Return blendshapes (N, 52) within 0..1 of intensities (N, 24) in the order of `FAU_VALUE`."""
     out = np.zeros((len(intensities), len(BLENDSHAPES)), np.float32)
     for column, places in _PLACES:
         out[:, places] = np.clip(intensities[:, column] / FULL, 0.0, 1.0)[:, None]
+    return out
+
+
+# --- Conversational states -------------------------------------------------------------------------------------------
+#
+# Which of the seven conversational states (3.3) the agent is in, from who speaks, what is feedback, and nods.
+#
+# The paper annotated its data by hand and shows the result in a figure alone; this rule is ours. Voice activity decides
+# what is possible; dialogue acts decide the rest:
+#
+# | agent | user | state |
+# |---|---|---|
+# | speaks | silent | speaking; giving feedback when it is an "mm-hm" into the other's pause |
+# | speaks | speaks | giving feedback when the agent's words are; receiving it when the user's are; else interrupted |
+# | silent | speaks | receiving feedback in the agent's turn; giving it while he nods; else listening |
+# | silent | silent | thinking when the agent spoke last and speaks next; else waiting |
+#
+# Feedback does not take the floor: who spoke last or speaks next leaves it out. Where no dialogue acts are at hand,
+# `short_answers` stands in for them.
+
+STATE: Final[Mapping[str, int]] = {name: index for index, name in enumerate(STATES)}
+UNKNOWN: Final = -1
+ANSWER_S: Final = 1.0  # shorter utterances in the other's turn are feedback, where nobody annotated it
+
+
+def states_of_activity(agent: Bools, user: Bools) -> NDArray[np.int8]:
+    """Return one state per frame (N,) from voice activity alone: short answers are feedback, and no nods are known."""
+    return states_of(agent, user, short_answers(agent, user), short_answers(user, agent), np.zeros_like(agent))
+
+
+def states_of(agent: Bools, user: Bools, agent_feedback: Bools, user_feedback: Bools, nods: Bools) -> NDArray[np.int8]:
+    """Return one state per frame (N,); see the table above.
+
+    Per frame (N,): who speaks, which of it is feedback (may reach beyond the speech), and whether the agent nods.
+    """
+    told, answered = agent & agent_feedback, user & user_feedback
+    floor = np.where(agent & ~told, 1, np.where(user & ~answered, -1, 0))
+    own_turn = (_latest(floor) == 1) & (_latest(floor[::-1])[::-1] == 1)  # the agent had the floor, and has it next
+    rules = (  # the first that holds
+        (told, "giving_feedback"),
+        (agent & answered, "receiving_feedback"),
+        (agent & user, "interrupted"),
+        (agent, "speaking"),
+        (answered & own_turn, "receiving_feedback"),
+        (user & nods, "giving_feedback"),
+        (user, "listening"),
+        (own_turn, "thinking"),
+    )
+    return np.select([rule for rule, _ in rules], [STATE[name] for _, name in rules], STATE["waiting"]).astype(np.int8)
+
+
+def _latest(floor: NDArray[np.int_]) -> NDArray[np.int_]:
+    """Return the newest value (N,) that is not 0, up to and with each frame; 0 before the first."""
+    newest = np.maximum.accumulate(np.where(floor != 0, np.arange(len(floor)), -1))
+    return np.where(newest >= 0, floor[newest], 0)
+
+
+def short_answers(active: Bools, other: Bools) -> Bools:
+    """Return utterances (N,) under a second that begin in the other's speech before the other continues."""
+    out = np.zeros(len(active), bool)
+    for start, end in runs(active):
+        before, after = other[max(0, start - FRAME_HZ // 2) : start + 1], other[end : end + FRAME_HZ]
+        if end - start < ANSWER_S * FRAME_HZ and before.any() and after.any():
+            out[start:end] = True
     return out

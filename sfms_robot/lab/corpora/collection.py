@@ -2,21 +2,36 @@
 
 Every layout of files on disk is one `Layout`. Its `scan` looks at names and headers only. Clips that cannot be used are
 left out by name, as a `Problem`, never silently.
+
+Arrays come from files of other projects: headers first, and never code. A pickle can run code. Those of data sets hold
+arrays and plain values, and only these are accepted.
 """
 
 from __future__ import annotations
 
+import csv
+import gzip
+import importlib
+import io
 import logging
-from collections import Counter
+import pickle
+import re
+import warnings
+import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, overload
 
+import numpy as np
+from numpy.typing import NDArray
+
 from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Floats
-from sfms_robot.lab.corpora.clips import UNREADABLE, Dyad
+from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, Dyad, samples_of
+from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
+from sfms_robot.signals.audio import read_audio
 
 _T = TypeVar("_T")
 Order = Literal["exp-first", "pose-first"]
@@ -25,6 +40,7 @@ Kind = Literal[
     "unreadable", "swapped order", "time stamps",
 ]  # fmt: skip
 
+WITH_VAL: Final = {"train": "train", "validation": "val", "test": "test"}  # our names of splits, and those of some
 _NAMED: Final = 5  # problems a warning names
 
 log = logging.getLogger(__name__)
@@ -45,13 +61,10 @@ class Problem:
 class ClipError(ConfigError):
     """One clip cannot be used; the others can."""
 
-    def __init__(self, problem: Problem) -> None:
-        super().__init__(str(problem))
-        self.problem = problem
-
-    @classmethod
-    def of(cls, kind: Kind, where: Path | str, detail: object) -> ClipError:
-        return cls(Problem(kind, str(where), str(detail).splitlines()[0] if str(detail) else type(detail).__name__))
+    def __init__(self, kind: Kind, where: Path | str, detail: object) -> None:
+        first_line = str(detail).splitlines()[0] if str(detail) else type(detail).__name__
+        self.problem = Problem(kind, str(where), first_line)
+        super().__init__(str(self.problem))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +138,7 @@ class Dataset(Sequence[Dyad]):
             return dyad
         shipped = {name: guarded(clip.name, clip.features[name]) for name in self.features if name in clip.features}
         if missing := [name for name in self.features if name not in shipped]:
-            raise ClipError.of("missing feature", clip.name, f"has no {', '.join(missing)}")
+            raise ClipError("missing feature", clip.name, f"has no {', '.join(missing)}")
         return guarded(clip.name, lambda: replace(dyad, features={**dyad.features, **shipped}))
 
     def map(self, change: Callable[[Dyad], Dyad], space: str | None = None) -> Dataset:
@@ -135,14 +148,6 @@ class Dataset(Sequence[Dyad]):
             return replace(clip, read=lambda: change(guarded(clip.name, clip.read)))
 
         return replace(self, space=space or self.space, clips=tuple(changed(clip) for clip in self.clips))
-
-    def summary(self) -> str:
-        """Return one line: clips and minutes, and the number that was left out."""
-        left_out = Counter(problem.kind for problem in self.problems)
-        said = ", ".join(f"{count} {kind}" for kind, count in left_out.items())
-        return f"{self.layout} {self.split}: {len(self)} clips, {self.minutes:.1f} min" + (
-            f"; left out: {said}" if said else ""
-        )
 
 
 def usable(dyads: Sequence[Dyad]) -> Iterator[Dyad]:
@@ -167,7 +172,7 @@ def guarded(where: str, read: Callable[[], _T]) -> _T:
     except ClipError:
         raise
     except (ConfigError, *UNREADABLE) as error:
-        raise ClipError.of("unreadable", where, error) from error
+        raise ClipError("unreadable", where, error) from error
 
 
 Found = Clip | Problem | str  # str: a note for a person
@@ -189,8 +194,8 @@ class Layout:
     Attributes:
         space, fps: Of the motion.
         splits: Names of the splits in a folder, by ours (train, validation, test, ...); empty: another layout.
-        scan: (root, their name of a split, whether pose channels stand first) -> clips, problems and notes. Reads
-            headers only where the format allows it.
+        scan: (root, their name of a split) -> clips, problems and notes. Reads headers only where the format allows
+            it.
         below: Folders in which the data may lie, relative to the given one.
         order: Order of the channels in the files as they are shipped; None: there is only one.
         held_out: Share of train that serves as validation where the layout ships none.
@@ -202,7 +207,7 @@ class Layout:
     space: str
     fps: float
     splits: Callable[[Path], Mapping[str, str]]
-    scan: Callable[[Path, str, bool], Iterable[Found]]
+    scan: Callable[[Path, str], Iterable[Found]]
     below: tuple[str, ...] = ("", "data")
     order: Order | None = None
     held_out: float = 0.0
@@ -215,10 +220,10 @@ class Layout:
 
     def dataset(self, place: Path, split: str, theirs: str, order: Order | None) -> Dataset:
         """Scan the split that the files call `theirs`. A file that several clips need is one problem."""
-        found = list(self.scan(place, theirs, order == "pose-first"))
+        found = list(self.scan(place, theirs))
         listed = enumerate(one for one in found if not isinstance(one, str))
         facts = {"space": self.space, "fps": self.fps, "licence": self.licence, **self.facts(place, theirs)}
-        return Dataset(
+        dataset = Dataset(
             layout=self.name,
             split=split,
             clips=tuple(replace(one, row=row) for row, one in listed if isinstance(one, Clip)),
@@ -226,3 +231,227 @@ class Layout:
             notes=tuple(one for one in found if isinstance(one, str)),
             **facts,
         )
+        if order != "pose-first":
+            return dataset
+        return dataset.map(  # the six channels of the pose last
+            lambda dyad: replace(
+                dyad, speaker=np.roll(dyad.speaker, -6, axis=1), listener=np.roll(dyad.listener, -6, axis=1)
+            )
+        )
+
+
+# --- Arrays from files of other projects ------------------------------------------------------------------------------
+
+SOUND_SLACK_S: Final = 0.2  # sound may end this much before the face: containers round
+FRAMES_SLACK: Final = 2  # two tracks of one clip may differ by this
+
+# What numpy's arrays are rebuilt from, by the names of numpy 1 and 2; nothing here runs anything else.
+_ARRAY_PARTS: Final = {
+    (module, name)
+    for part in ("numpy.core", "numpy._core")
+    for module, name in (
+        (f"{part}.multiarray", "_reconstruct"),
+        (f"{part}.multiarray", "scalar"),
+        (f"{part}.numeric", "_frombuffer"),
+    )
+} | {("numpy", "ndarray"), ("numpy", "dtype"), ("_codecs", "encode"), ("collections", "OrderedDict")}
+
+
+_CORE: Final = "numpy.core" if np.__version__.startswith("1.") else "numpy._core"
+
+
+class _ArraysOnly(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) not in _ARRAY_PARTS:
+            raise pickle.UnpicklingError(f"asks for {module}.{name}: only arrays and plain values are read")
+        return getattr(_module(module), name)
+
+
+def _module(name: str) -> Any:
+    """Import one of numpy's modules, whose names differ between numpy 1 and 2."""
+    return importlib.import_module(re.sub(r"numpy\._?core", _CORE, name))
+
+
+def unpickle(file: Path) -> Any:
+    """Return arrays and plain values of a pickle. Raises UnpicklingError for one that asks for more, or is broken."""
+    content = io.BytesIO(file.read_bytes())
+    try:
+        return _ArraysOnly(content).load()
+    except (AttributeError, ImportError, OverflowError, MemoryError, AssertionError, *UNREADABLE) as error:
+        raise pickle.UnpicklingError(str(error) or "broken") from error
+
+
+def torch_load(file: Path) -> Any:
+    """Return what torch saved: tensors, arrays and plain values, as `weights_only` allows.
+
+    Raises ClipError for a file that needs more.
+    """
+    import torch
+
+    arrays: list[Callable[..., Any] | tuple[Callable[..., Any], str]] = [
+        (getattr(_module(module), name), f"{module}.{name}") for module, name in sorted(_ARRAY_PARTS)
+    ]
+    arrays += [type(np.dtype(kind)) for kind in ("f2", "f4", "f8", "i2", "i4", "i8", "u1", "?", "U1", "S1")]
+    try:
+        with torch.serialization.safe_globals(arrays), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # scrambled bytes look like a protocol of the future
+            return torch.load(file, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        detail = "holds more than tensors, arrays and plain values; save it again with these alone"
+        raise ClipError("unreadable", file, detail) from error
+    except (RuntimeError, *UNREADABLE) as error:
+        raise ClipError("unreadable", file, error) from error
+
+
+def existing(file: Path, kind: Kind = "missing half") -> Path:
+    """Return a file that is there. Raises ClipError, of this kind."""
+    if not file.is_file():
+        raise ClipError(kind, file, "no such file")
+    return file
+
+
+def npy(file: Path) -> NDArray[Any]:
+    """Map an array on disk into memory. Raises ClipError."""
+    try:
+        out: NDArray[Any] = np.load(existing(file), mmap_mode="r", allow_pickle=False)
+    except UNREADABLE as error:
+        raise ClipError("unreadable", file, error) from error
+    if not isinstance(out, np.ndarray):
+        out.close()  # an archive of several
+        raise ClipError("unreadable", file, "no array")
+    if out.dtype.kind not in "fiu":
+        raise ClipError("wrong dims", file, f"holds {out.dtype}, no numbers")
+    return out
+
+
+def table(file: Path) -> list[list[str]]:
+    """Return the rows of a CSV file, gzipped or not, with its header, without empty rows. Raises ConfigError."""
+    try:
+        with gzip.open(file, "rb") if file.suffix == ".gz" else file.open("rb") as stream:
+            lines = io.TextIOWrapper(stream, encoding="utf-8-sig", newline="")
+            return [row for row in csv.reader(lines) if row]
+    except (OSError, EOFError, ValueError, csv.Error) as error:
+        raise ConfigError(f"{file}: not a table: {error}") from error
+
+
+def columns(file: Path) -> dict[str, list[str]]:
+    """Return the columns of a CSV file by their names in the header. Raises ConfigError."""
+    try:
+        header, *rows = table(file)
+        return dict(zip(header, map(list, zip(*rows, strict=True)) if rows else ([] for _ in header), strict=True))
+    except ValueError as error:
+        raise ConfigError(f"{file}: not a table: {error}") from error
+
+
+def npz(file: Path, *keys: str) -> list[NDArray[Any]]:
+    """Return arrays of a .npz. Raises what `UNREADABLE` names."""
+    with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+        return [arrays[key] for key in keys]
+
+
+def npz_shapes(file: Path) -> dict[str, tuple[int, ...]]:
+    """Read the shapes of the arrays of a .npz from their headers. Raises ClipError."""
+    shapes = {}
+    try:
+        with zipfile.ZipFile(file) as archive:
+            for member in archive.namelist():
+                with archive.open(member) as stream:
+                    version = np.lib.format.read_magic(stream)
+                    header = (
+                        np.lib.format.read_array_header_1_0
+                        if version == (1, 0)
+                        else np.lib.format.read_array_header_2_0
+                    )
+                    shapes[member.removesuffix(".npy")] = header(stream)[0]
+    except UNREADABLE as error:
+        raise ClipError("unreadable", file, error) from error
+    return shapes
+
+
+def frames_of(name: str, *tracks: tuple[int, ...], slack: int = FRAMES_SLACK) -> int:
+    """Return the frames that tracks of these shapes share; singleton axes do not count. Raises ClipError."""
+    lengths = [next((size for size in shape[:-1] if size != 1), 1) for shape in tracks]
+    if max(lengths) - min(lengths) > slack:
+        raise ClipError("lengths differ", name, f"{max(lengths)} frames beside {min(lengths)}")
+    return min(lengths)
+
+
+def track(name: str, values: NDArray[Any], frames: int, width: int, *, gaps: bool = False) -> Floats:
+    """Return the first frames of a track (T, >= width) or with singleton axes, as (frames, width) float32.
+
+    Raises ClipError for other shapes, and for values that are not finite unless `gaps` are allowed.
+    """
+    one_axis_of_time = values.ndim > 2 and sum(size != 1 for size in values.shape[:-1]) <= 1
+    array = values.reshape(-1, values.shape[-1]) if one_axis_of_time else values
+    if array.ndim != 2 or array.shape[1] != width or len(array) < frames:
+        raise ClipError("wrong dims", name, f"shape {values.shape}, expected ({frames}, {width})")
+    out = np.array(array[:frames], dtype=np.float32)
+    bad = ~np.isfinite(out).all(axis=1)
+    if bad.any() and not gaps:
+        raise ClipError("not finite", name, f"{int(bad.sum())} of {frames} frames, first {int(bad.argmax())}")
+    return out
+
+
+def sound(file: Path, frames: int, fps: float) -> Floats:
+    """Return a voice cut to the length of its face, or padded if it ends a little early. Raises ClipError."""
+    audio, wanted = read_audio(existing(file, "missing sound")), samples_of(frames, fps)
+    if wanted - len(audio) > SOUND_SLACK_S * AUDIO_HZ:
+        detail = f"{len(audio) / AUDIO_HZ:.2f} s of sound for {frames / fps:.2f} s of face"
+        raise ClipError("lengths differ", file, detail)
+    return np.pad(audio[:wanted], (0, max(0, wanted - len(audio))))
+
+
+def voices_of(*files: Path) -> list[Path]:
+    """Return the files of a clip's voices. Raises ClipError if the speaker's, the first, is missing."""
+    existing(files[0], "missing sound")
+    return list(files)
+
+
+def dyad_of(
+    name: str,
+    faces: Sequence[tuple[object, NDArray[Any]]],
+    frames: int,
+    space: str,
+    fps: float,
+    *,
+    voices: Sequence[Path] = (),
+    mel: Floats | None = None,
+    own: bool = False,
+) -> Dyad:
+    """Return a dyad of a data set without annotations: the two voices, where both are there, say who listens when.
+
+    Without the listener's voice the listener listens all the time, as the role in the data says.
+
+    Args:
+        faces: Origin and rows (T, D) of the speaker, which may have gaps, and of the listener.
+        voices: Files of the speaker's and the listener's voice; the second may be missing.
+        own: Let the dyad carry the listener's voice.
+    """
+    speaker, listener = (
+        track(str(origin), rows, frames, WIDTHS[space], gaps=gaps)
+        for (origin, rows), gaps in zip(faces, (True, False), strict=True)
+    )
+    audio = sound(voices[0], frames, fps) if voices else None
+    said = sound(voices[1], frames, fps) if voices and voices[1].is_file() else None
+    listening = np.ones(frames, bool)
+    if audio is not None and said is not None:
+        listening = listening_mask(speaks(audio, frames, fps), fps, speaks(said, frames, fps))
+    return Dyad(
+        name=name, audio=audio, speaker=speaker, listener=listener, listening=listening, space=space, fps=fps, mel=mel,
+        agent_audio=said if own else None,
+    )  # fmt: skip
+
+
+def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
+    """Return (frames,) True in frames with speech; False after the end of the sound."""
+    active = voice_activity(voice, AUDIO_HZ, 1 / fps)[:frames]
+    return np.pad(active, (0, frames - len(active)))
+
+
+def numbers(values: Mapping[str, Any], key: str) -> NDArray[Any]:
+    """Return an array or tensor of a dict. Raises KeyError, or TypeError for anything else."""
+    found = values[key]
+    array = np.asarray(found.numpy() if hasattr(found, "numpy") else found)
+    if array.dtype.kind not in "fiu":
+        raise TypeError(f"{key} holds no numbers")
+    return array

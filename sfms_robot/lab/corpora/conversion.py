@@ -5,6 +5,7 @@ Nothing is invented: a channel without a source stays at rest. What is lost is m
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -61,16 +62,15 @@ class Residual:
 
     def told(self) -> dict[str, Any]:
         """Return figures by name, None for those that do not apply; degrees and shares."""
-        return {
-            "pose_round_trip_deg": float(np.degrees(self.pose_rad)),
-            "resampling_rms_deg": float(np.degrees(np.sqrt(self.resampled_rad2 / self.resampled)))
-            if self.resampled
-            else None,
-            "expression_lost_share": float(np.sqrt(self.left2 / self.expression2)) if self.expression2 else None,
-            "cut_share": self.beyond / self.values if self.values else None,
-            "stored_pose_deg": float(np.degrees(self.stored_rad)),
-            "stored_blendshape": self.stored,
-        }
+        figures = (
+            math.degrees(self.pose_rad),
+            math.degrees(math.sqrt(self.resampled_rad2 / self.resampled)) if self.resampled else None,
+            math.sqrt(self.left2 / self.expression2) if self.expression2 else None,
+            self.beyond / self.values if self.values else None,
+            math.degrees(self.stored_rad),
+            self.stored,
+        )
+        return dict(zip(FIGURES, figures, strict=True))
 
     def written(self, converted: Dyad, read_back: Dyad) -> None:
         """Take in what the file holds of a converted dyad."""
@@ -86,13 +86,16 @@ def to_ours(dyad: Dyad, residual: Residual, flame: FlameMatrix | None = None) ->
     """
     if dyad.space not in CONVERTIBLE:
         raise ConfigError(f"{dyad.name}: {dyad.space} cannot become arkit58 ({', '.join(CONVERTIBLE)})")
-    if flame is not None and dyad.space != "deca56":
-        raise ConfigError(f"--flame-matrix: {dyad.space} has no FLAME expression (deca56 has)")
     ours = in_arkit(dyad, flame)
     _lost(dyad, ours.listener, residual, flame)
     slower = at_frame_rate(ours)
-    if slower is not ours:
-        _resampled(ours, slower, residual)
+    if slower is not ours:  # our angles at the instants of the source's frames; a frame stands for its end
+        theirs_s, ours_s = ((np.arange(len(each.listener)) + 1) / each.fps for each in (ours, slower))
+        inside = (theirs_s >= ours_s[0]) & (theirs_s <= ours_s[-1])
+        for column in range(_ANGLES.stop):
+            back = np.interp(theirs_s[inside], ours_s, slower.listener[:, column])
+            residual.resampled_rad2 += float(np.square(back - ours.listener[inside, column]).sum())
+            residual.resampled += int(inside.sum())
     return slower
 
 
@@ -154,17 +157,6 @@ def _apart_rad(filed: Doubles, ours: Floats, space: str) -> Doubles:
 
     apart: Doubles = (turns(filed[:, columns]) * turns(back).inv()).magnitude()
     return apart
-
-
-def _resampled(filed: Dyad, ours: Dyad, residual: Residual) -> None:
-    """Compare our angles at the instants of the source's frames (a frame stands for its end)."""
-    theirs_s = (np.arange(len(filed.listener)) + 1) / filed.fps
-    ours_s = (np.arange(len(ours.listener)) + 1) / FRAME_HZ
-    inside = (theirs_s >= ours_s[0]) & (theirs_s <= ours_s[-1])
-    for column in range(_ANGLES.stop):
-        back = np.interp(theirs_s[inside], ours_s, ours.listener[:, column])
-        residual.resampled_rad2 += float(np.square(back - filed.listener[inside, column]).sum())
-        residual.resampled += int(inside.sum())
 
 
 # --- Dyads of other frame rates at 25 fps: what a listener that is streamed through them asks for -----------------

@@ -26,25 +26,13 @@ from sfms_robot.lab.corpora.conversion import CONVERTIBLE, FIGURES, Residual, to
 from sfms_robot.signals.spaces import FlameMatrix, read_matrix
 
 
-def _scanned(layout: Layout, place: Path, split: str, order: Order | None) -> Dataset:
-    """Read names and headers of a split, with a message: of many files even these take some time."""
-    with bar(f"{split}: headers"):
-        return formats.scan_split(layout, place, split, order)
-
-
-def compose_dyads(
-    data: Path, out: Path, minutes: float, seed: int, overwrite: bool = False, jobs: int = 1
-) -> dict[str, Any]:
+def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: bool, jobs: int) -> dict[str, Any]:
     """Compose into out/train, out/validation and out/test. Returns the minutes written per split."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
     with bar("composing dyads") as moved:
-
-        def told(name: str, wanted: float, done: float) -> None:
-            moved(done, wanted, f"{name}, {done:.0f} of {wanted:.0f} minutes")
-
         moved(0, 0, "reading")
-        return dict(compose_folder(data, out, seed, minutes, told=told, overwrite=overwrite, jobs=jobs))
+        return dict(compose_folder(data, out, seed, minutes, moved, overwrite, jobs))
 
 
 # --- `data check` ---------------------------------------------------------------------------------------------------
@@ -80,7 +68,7 @@ def check_data(folder: Path, layout: str = "auto", order: Order | None = None, w
 def _checked(layout: Layout, place: Path, split: str, order: Order | None, window: int) -> dict[str, Any]:
     """Read every clip of a split; return its report."""
     try:
-        dataset = _scanned(layout, place, split, order)
+        dataset = formats.scan_split(layout, place, split, order)
     except ConfigError as error:
         dataset = Dataset(
             layout=layout.name, split=split, space=layout.space, fps=layout.fps, clips=(),
@@ -90,7 +78,7 @@ def _checked(layout: Layout, place: Path, split: str, order: Order | None, windo
     for index, clip in enumerate(tracked(dataset.clips, split)):
         try:
             if clip.frames < (least := max(1, window)):
-                raise ClipError.of("too short", clip.name, f"{clip.frames} frames, a window needs {least}")
+                raise ClipError("too short", clip.name, f"{clip.frames} frames, a window needs {least}")
             tally.add(dataset[index], clip)
             kept.append(clip)
         except ClipError as error:
@@ -216,7 +204,7 @@ def convert_data(
     if out.is_dir() and any(out.iterdir()):
         raise ConfigError(f"{out}: is not empty: dyads of two conversions would be mixed")
     residual = Residual()
-    sets = [_scanned(found, place, name, order) for name in formats.split_names(found, place)]
+    sets = [formats.scan_split(found, place, name, order) for name in formats.split_names(found, place)]
     licence = next((one.licence for one in sets if one.licence), None)
     out.mkdir(parents=True, exist_ok=True)
     origin = {"layout": found.name, "folder": str(place.resolve()), "licence": licence}

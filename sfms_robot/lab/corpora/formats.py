@@ -7,6 +7,7 @@ default the layout's own; files that look like the other one are refused before 
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -15,14 +16,14 @@ from typing import Any, Final, get_args
 
 import numpy as np
 
+from sfms_robot.app.progress import bar
 from sfms_robot.config.base import read as read_yaml
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats
 from sfms_robot.lab.corpora.clips import FEATURE, SPLITS, read
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Found, Layout, Order, attempt
+from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Found, Layout, Order, attempt, npz, npz_shapes
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_arkit
 from sfms_robot.lab.corpora.external import dualtalk, l2l, react, seamless, vico
-from sfms_robot.lab.corpora.reading import npz, npz_shapes
 
 # --- Dyads as `clips.save` keeps them: `{train,validation,test}/NAME.npz`, from `data compose` and `data convert` -----
 
@@ -45,7 +46,7 @@ def _stored_kind(file: Path) -> tuple[str, float]:
     """Return space and frame rate of one dyad. Raises ClipError for another file."""
     shapes = npz_shapes(file)
     if "listening" not in shapes:
-        raise ClipError.of("unreadable", file, "not a dyad: has no listening")
+        raise ClipError("unreadable", file, "not a dyad: has no listening")
     space, fps = npz(file, "space", "fps") if "space" in shapes else ("arkit58", FRAME_HZ)
     return str(space), float(fps)
 
@@ -71,13 +72,13 @@ def _stored_facts(place: Path, split: str) -> Mapping[str, Any]:
     return facts
 
 
-def _stored_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def _stored_scan(place: Path, split: str) -> Iterator[Found]:
     kinds: list[tuple[str, float]] = []
 
     def clip(file: Path) -> Clip:
         kinds.append(kind := _stored_kind(file))
         if kind != kinds[0]:
-            raise ClipError.of("wrong dims", file, f"{kind[0]} at {kind[1]:g} fps among {kinds[0][0]}")
+            raise ClipError("wrong dims", file, f"{kind[0]} at {kind[1]:g} fps among {kinds[0][0]}")
         shapes = npz_shapes(file)
         features = {key.removeprefix(FEATURE): partial(_stored_feature, file, key)
                     for key in shapes if key.startswith(FEATURE)}  # fmt: skip
@@ -165,7 +166,11 @@ def open_dataset(
         raise ConfigError(f"{place}: {said}")
     dataset = replace(dataset, features=tuple(features))
     if dataset.problems:
-        log.warning("%s", dataset.summary())
+        left_out = Counter(problem.kind for problem in dataset.problems)
+        said = ", ".join(f"{count} {kind}" for kind, count in left_out.items())
+        log.warning(
+            "%s %s: %d clips, %.1f min; left out: %s", found.name, dataset.split, len(dataset), dataset.minutes, said
+        )
     if dataset.licence is not None and dataset.split == "train":  # what weights come from
         log.warning("%s: %s", place, dataset.licence)
     return dataset
@@ -196,7 +201,8 @@ def scan_split(layout: Layout, place: Path, split: str, order: Order | None = No
     if split not in split_names(layout, place):
         raise ConfigError(f"{place}: has no split {split} ({', '.join(split_names(layout, place)) or 'none'})")
     held_out = "validation" not in theirs and layout.held_out
-    whole = layout.dataset(place, split, theirs.get(split, theirs.get("train", "")), order or layout.order)
+    with bar(f"{split}: headers"):  # of many files even these take some time
+        whole = layout.dataset(place, split, theirs.get(split, theirs.get("train", "")), order or layout.order)
     if not held_out or split not in ("train", "validation"):
         return whole
     rank = np.random.default_rng(_SEED).permutation(len(whole))

@@ -17,7 +17,7 @@ import numpy as np
 from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles
-from sfms_robot.lab.corpora.reading import npy
+from sfms_robot.lab.corpora.collection import npy
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.intervals import estimates, quotient
 from sfms_robot.lab.evaluation.metrics import CLUSTERS, NEEDED_FRAMES, PARTS

@@ -30,10 +30,9 @@ from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE_CHANNELS, Bools, Doubles, Floats, SpeakerFrame, changed
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.collection import usable
+from sfms_robot.lab.corpora.collection import speaks, usable
 from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.formats import detect, open_for, split_names
-from sfms_robot.lab.corpora.reading import speaks
 from sfms_robot.lab.evaluation.detection import middle, movement, nods_of, slow_poses_deg
 from sfms_robot.lab.evaluation.intervals import Chosen, bootstrap, intervals, people_of, rounded
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sfms_robot.config.listener import STATES
-from sfms_robot.lab.corpora import conversational_states as labels
-from sfms_robot.lab.corpora.conversational_states import STATE, Voices, label, of_activity
+from sfms_robot.lab.corpora.clips import STATE, short_answers, states_of, states_of_activity
 
 # (agent speaks, user speaks) that a state may have.
 PATTERNS = {
@@ -29,7 +28,7 @@ def mask(text: str) -> np.ndarray:
 
 def said(agent: str, user: str, agent_feedback: str = "", user_feedback: str = "", nods: str = "") -> list[str]:
     tracks = [mask(text.ljust(len(agent), ".")) for text in (agent, user, agent_feedback, user_feedback, nods)]
-    return [STATES[state] for state in label(Voices(*tracks))]
+    return [STATES[state] for state in states_of(*tracks)]
 
 
 def test_every_state_has_a_pattern_and_every_pattern_a_state():
@@ -39,16 +38,16 @@ def test_every_state_has_a_pattern_and_every_pattern_a_state():
 
 @given(MASKS)
 def test_every_frame_has_one_state_that_its_voices_allow_and_swapping_who_speaks_swaps_it(masks):
-    states = label(Voices(*masks))
+    states = states_of(*masks)
     assert states.shape == masks[0].shape
     for state, agent, user in zip(states, masks[0], masks[1], strict=True):
         assert (bool(agent), bool(user)) in PATTERNS[STATES[state]]
     agent, user = masks[0] & ~masks[1], masks[1] & ~masks[0]
     never = np.zeros_like(agent)
-    ours, theirs = label(Voices(agent, user, never, never, never)), label(Voices(user, agent, never, never, never))
+    ours, theirs = states_of(agent, user, never, never, never), states_of(user, agent, never, never, never)
     assert np.array_equal(ours == STATE["speaking"], theirs == STATE["listening"])
     silent = np.zeros_like(masks[0])
-    assert (label(Voices(silent, silent, *masks[2:])) == STATE["waiting"]).all()
+    assert (states_of(silent, silent, *masks[2:]) == STATE["waiting"]).all()
 
 
 def test_a_pause_inside_the_own_turn_is_thinking_and_any_other_is_waiting():
@@ -76,9 +75,9 @@ def test_words_and_nods_give_feedback():
 def test_without_dialogue_acts_short_words_in_the_others_turn_are_answers(frames, answer):
     other, active = np.ones(100, bool), np.zeros(100, bool)
     active[40 : 40 + frames] = True
-    assert labels.short_answers(active, other).any() == answer and not labels.short_answers(active, ~other).any()
+    assert short_answers(active, other).any() == answer and not short_answers(active, ~other).any()
 
 
 def test_activity_alone_is_labelled_too():
-    found = label(of_activity(mask("xxxx...."), mask("....xxxx")))
+    found = states_of_activity(mask("xxxx...."), mask("....xxxx"))
     assert [STATES[state] for state in found] == ["speaking"] * 4 + ["listening"] * 4

@@ -5,16 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ami_tables import HEADERS
 
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, EVENT_KINDS, FRAME_HZ, FRAME_S, POSE, SHAPES
 from sfms_robot.lab.corpora import clips
-from sfms_robot.lab.corpora.clips import SPLITS, load
+from sfms_robot.lab.corpora.clips import SPLITS
 from sfms_robot.lab.corpora.compose import ami, composed
-from sfms_robot.lab.corpora.compose.render_events import Score, act, mirrored, nod_habit, nod_manner
+from sfms_robot.lab.corpora.compose.render_events import Score, act, mirrored, nod_habit, nod_of
 from sfms_robot.lab.corpora.compose.speaking import Dwell, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import find_voices, lay, read_voice, split_voices
+from sfms_robot.lab.corpora.formats import open_dataset
 from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
 from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
 from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, directions
@@ -87,27 +89,24 @@ def tables(tmp_path_factory):
         rows["words"].append((meeting, "A", 61.0, 62.0, "vocalsound", "laugh"))
         rows["words"].append((meeting, "B", 101, 101.5, "vocalsound", "laugh"))
     for name, lines in rows.items():
-        header = list(ami._COLUMNS[name])
-        if name == "participants":
-            header = ["meeting", "agent", "participant", "role", "head_annotated_until_s", "n", "has_gaze_focus"]
         with (folder / f"{name}.csv").open("w", newline="") as file:
-            csv.writer(file).writerows([header, *lines])
+            csv.writer(file).writerows([HEADERS[name].split(","), *lines])
     return folder
 
 
-def compose(ami_folder, voices, seed, minutes):
-    material = composed.read_material(ami_folder, voices, MOTIONS)
+def compose(ami_folder, seed, minutes):
+    material = composed.material_of(ami_folder)
     return {split: [*composed.dyads(material, "listening", split, seed, minutes)] for split in SPLITS}
 
 
 @pytest.fixture(scope="module")
 def made(tables):
-    return compose(tables, VOICES, seed=3, minutes=3)
+    return compose(tables, seed=3, minutes=3)
 
 
 def test_one_seed_composes_the_same_dyads_and_another_one_others(tables, made):
-    again = compose(tables, VOICES, seed=3, minutes=3)
-    other = compose(tables, VOICES, seed=4, minutes=3)
+    again = compose(tables, seed=3, minutes=3)
+    other = compose(tables, seed=4, minutes=3)
     assert [d.name for d in again["train"]] == [d.name for d in made["train"]]
     for one, two in zip(again["train"], made["train"], strict=True):
         np.testing.assert_array_equal(one.listener, two.listener)
@@ -178,18 +177,18 @@ def test_a_new_set_replaces_the_old_one_and_nothing_else(tables, tmp_path):
 
 def test_written_sets_read_back(tables, tmp_path):
     told = []
-    written = composed.compose_folder(tables, tmp_path, seed=1, minutes=1, told=lambda *one: told.append(one))
+    written = composed.compose_folder(tables, tmp_path, seed=1, minutes=1, moved=lambda *one: told.append(one))
     for split in SPLITS:
-        assert sum(len(dyad.listener) for dyad in load(tmp_path / split)) / FRAME_HZ / 60 == pytest.approx(
+        assert sum(len(dyad.listener) for dyad in open_dataset(tmp_path, split)) / FRAME_HZ / 60 == pytest.approx(
             written[split]
         )
-    assert {name for name, _, _ in told} == {"listening", "interaction", "speaking"} - {
+    assert {what.split(",")[0] for _, _, what in told} == {"listening", "interaction", "speaking"} - {
         name for name in ("interaction", "speaking") if not written[f"{name}_train"]
     }
-    listening = [done for name, _, done in told if name == "listening"]
+    listening = [done for done, _, what in told if what.startswith("listening,")]
     assert listening == sorted(listening)
     assert listening[-1] == pytest.approx(sum(written[split] for split in SPLITS))
-    (spoken, *_) = load(tmp_path / "speaking" / "train")
+    (spoken, *_) = open_dataset(tmp_path / "speaking", "train")
     assert {event.kind for event in spoken.events} >= {"blink"}
 
 
@@ -227,7 +226,9 @@ def test_the_speaker_smiles_where_people_laughed_and_nods_where_they_nodded(tabl
     smiles, nods = 0, 0
     for seed in range(12):
         stretch = composed.Stretch(person=person, start_s=50.0, end_s=80.0)
-        _, face = composed.speaker_of(stretch, katie, motions["train"], np.random.default_rng(seed))
+        _, face = composed.speaker_of(
+            stretch, katie, motions["train"], np.random.default_rng(seed), [], np.zeros((0, 3))
+        )
         if np.isnan(face).any():
             continue
         laughing, later = slice(12 * FRAME_HZ, 13 * FRAME_HZ), slice(18 * FRAME_HZ, 20 * FRAME_HZ)
@@ -344,8 +345,8 @@ def test_smiles_last_as_long_as_peoples(motions):
 
 def test_nods_are_made_as_a_person_makes_them():
     rng = np.random.default_rng(0)
-    made = [nod_manner(nod_habit(rng), length_s, rng) for length_s in np.repeat([0.3, 0.6, 1.2, 3.0], 300)]
-    sizes = np.degrees([one.size_rad for one in made])
+    made = [nod_of("nod", 0.0, length_s, nod_habit(rng), rng) for length_s in np.repeat([0.3, 0.6, 1.2, 3.0], 300)]
+    sizes = np.degrees([one.size for one in made])
     assert sizes.min() >= 2.2 - 1e-6 and sizes.max() <= 12 + 1e-6 and 4 < np.median(sizes) < 6
     assert {one.swings for one in made} == {1, 2, 3, 4}
     for one in made:
@@ -407,12 +408,12 @@ def test_what_cannot_be_composed_is_one_line(tmp_path, tables):
     with pytest.raises(ConfigError, match=r"words.csv: column = 'text' is missing"):
         ami.read_people(tmp_path)
     with pytest.raises(ConfigError, match="no WAV or FLAC file to take voices from"):
-        compose(tables, [tmp_path], seed=1, minutes=1)
+        find_voices([tmp_path])
     (tmp_path / "motions.npz").write_bytes(b"nothing")
     with pytest.raises(ConfigError, match="motions.npz: not a file of motion primitives"):
         read_motions(tmp_path / "motions.npz")
     with pytest.raises(ConfigError, match="--minutes -1: must be above 0"):
-        compose(tables, VOICES, seed=1, minutes=-1)
+        compose(tables, seed=1, minutes=-1)
 
 
 @pytest.mark.slow
@@ -420,7 +421,7 @@ def test_several_jobs_write_the_files_of_one(tables, tmp_path):
     told = []
     for jobs in (1, 2):
         found = composed.compose_folder(
-            tables, tmp_path / str(jobs), 1, 2.0, lambda name, *minutes: told.append(name), jobs=jobs
+            tables, tmp_path / str(jobs), 1, 2.0, lambda done, wanted, what: told.append(what.split(",")[0]), jobs=jobs
         )
     assert found["train"] > 0 and "listening" in told
     one, two = (

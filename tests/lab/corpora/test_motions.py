@@ -9,9 +9,9 @@ import pytest
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ
 from sfms_robot.lab.corpora.clips import SPLITS, read_takes
+from sfms_robot.lab.corpora.collection import columns
 from sfms_robot.lab.corpora.compose.motions import slow
 from sfms_robot.lab.corpora.compose.voices import facegood_mouth
-from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.signals.motion_primitives import KINDS, read_motions
 from sfms_robot.signals.tracks import Take
 

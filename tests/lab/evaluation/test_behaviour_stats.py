@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sfms_robot.data import data_dir
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, MOTION_DIM
-from sfms_robot.lab.corpora.compose.render_events import NodManner, nod_curve
+from sfms_robot.lab.corpora.compose.render_events import nod_curve
 from sfms_robot.lab.evaluation import detection
 from sfms_robot.listeners.events.model import EventModel
 from sfms_robot.signals.motion_primitives import read_motions
@@ -43,8 +45,8 @@ def test_nods_that_a_listener_draws_are_as_long_as_peoples():
     nods = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"].nods
     for seed in range(200):
         event, motion = model.shaped("nod", 100, seed), still(9)
-        manner = NodManner(event.size, event.swings, event.duration_s, 0.8)
-        motion[:, CHANNEL_INDEX["pitch"]] = nod_curve(manner, nods[seed % len(nods)], 2.0, len(motion))
+        nod = replace(event, start_s=2.0)
+        motion[:, CHANNEL_INDEX["pitch"]] = nod_curve(nod, 0.8, nods[seed % len(nods)], len(motion))
         drawn.append(motion)
     _, length_s, cycle_s, _ = np.median(detection.nods_of(drawn), axis=0)
     assert 0.8 < length_s / 0.50 < 1.25 and 0.8 < cycle_s / 0.20 < 1.25

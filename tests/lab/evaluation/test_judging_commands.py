@@ -10,6 +10,7 @@ from tiny_arig_training import dyad
 
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, FRAME_SAMPLES
 from sfms_robot.lab.corpora import clips
+from sfms_robot.lab.corpora.formats import open_dataset
 from sfms_robot.lab.evaluation import naturalness
 from sfms_robot.lab.evaluation.detection import movement, nods_of
 from sfms_robot.lab.evaluation.naturalness import FOLDS, REGIONS, compared, listening, nod_ratios, notes
@@ -63,7 +64,7 @@ def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tm
 
 
 def test_windows_in_which_the_listener_talks_himself_are_not_judged(tmp_path):
-    (dyads,) = [clips.load(people(tmp_path, ("validation",), count=1) / "validation")]
+    dyads = open_dataset(people(tmp_path, ("validation",), count=1), "validation")
     one = replace(dyads[0], agent_audio=None)
     (every,) = listening([one], [one.listener])
     audio = np.zeros(len(one.listener) * FRAME_SAMPLES, np.float32)
@@ -76,7 +77,7 @@ def test_people_who_do_nothing_and_whose_gaze_nobody_knows_leave_figures_out(tmp
     """No laugh, no nod, no annotated gaze, nobody to be trained on: None and a note, no number made up."""
     still = np.zeros((12 * FRAME_HZ, 58), np.float32)
     data = people(tmp_path, ("validation",), count=3, listener=still, attention=None, events=())
-    dyads = clips.load(data / "validation")
+    dyads = open_dataset(data, "validation")
     nothing = movement([dyad.listener for dyad in dyads], [np.ones(len(still), bool)] * len(dyads))
     ratios = nod_ratios([nods_of([still])] * 3, [nods_of([still])] * 3, np.arange(3))
     found = compared({**ratios, **nothing}, nothing)

@@ -7,8 +7,8 @@ Times are seconds of the meeting; an interval table is (K, 2) start, end, sorted
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -17,7 +17,7 @@ import numpy as np
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
 from sfms_robot.lab.corpora.clips import Split, by_split, split_of
-from sfms_robot.lab.corpora.reading import columns
+from sfms_robot.lab.corpora.collection import columns
 
 GAP_S: Final = 0.2  # shorter silences are part of a phrase
 NODS: Final = ("concord_signal nod", "concord_signal ")  # form nod, and form left blank
@@ -26,11 +26,10 @@ _ALONE_S: Final = 0.5  # of silence before and after it
 _COLUMNS: Final = {
     "participants": ("meeting", "agent", "participant", "head_annotated_until_s", "has_gaze_focus"),
     "head_gestures": ("meeting", "agent", "start_s", "end_s", "type", "form"),
-    "gaze_focus": ("meeting", "agent", "start_s", "end_s", "type", "target"),
+    "gaze_focus": ("meeting", "agent", "start_s", "end_s", "target"),
     "words": ("meeting", "agent", "start_s", "end_s", "kind", "text"),
     "dialogue_acts": ("meeting", "agent", "start_s", "end_s", "type"),
 }
-_Rows = dict[str, list[str]]
 LabelledSpan = tuple[float, float, str]  # start, end [s], and what or which agent
 _Spans = dict[tuple[str, str], list[LabelledSpan]]
 
@@ -75,26 +74,26 @@ class MeetingPerson:
     floor: tuple[LabelledSpan, ...]
     others_laughs: Doubles
     asked: Doubles
-    others_backchannels: Doubles = field(default_factory=lambda: np.zeros((0, 2)))
-    mm_hms: Doubles = field(default_factory=lambda: np.zeros((0, 2)))
-    others_nods: tuple[LabelledSpan, ...] = ()
-    looked_at: tuple[LabelledSpan, ...] = ()
-    gaze_known: frozenset[str] = frozenset()
-    words: Mapping[str, Doubles] = field(default_factory=dict)
+    others_backchannels: Doubles
+    mm_hms: Doubles
+    others_nods: tuple[LabelledSpan, ...]
+    looked_at: tuple[LabelledSpan, ...]
+    gaze_known: frozenset[str]
+    words: Mapping[str, Doubles]
 
 
 def read_people(folder: Path) -> list[MeetingPerson]:
     """Return all persons whose head was annotated. Raises ConfigError naming the table, and a missing column."""
-    gestures, gaze = _spans(folder, "head_gestures", "type", "form"), _spans(folder, "gaze_focus", "target")
-    words, acts = _spans(folder, "words", "kind", "text"), _spans(folder, "dialogue_acts", "type")
+    gestures, gaze, words, acts = (
+        _spans(folder, name) for name in ("head_gestures", "gaze_focus", "words", "dialogue_acts")
+    )
     listed = _table(folder, "participants")
     agents = defaultdict(list)
-    for meeting, agent in zip(listed["meeting"], listed["agent"], strict=True):
+    for meeting, agent, *_ in listed:
         agents[meeting].append(agent)
-    said = {key: np.array(_spoken(found), np.float64).reshape(-1, 2) for key, found in words.items()}
+    said = {key: interval_table(_spoken(found)) for key, found in words.items()}
     people = []
-    rows = zip(*(listed[name] for name in _COLUMNS["participants"]), strict=True)
-    for meeting, agent, participant, until, has_gaze in rows:
+    for meeting, agent, participant, until, has_gaze in listed:
         if float(until or 0) < 60:
             continue
         key, others = (meeting, agent), [(meeting, other) for other in agents[meeting] if other != agent]
@@ -135,6 +134,11 @@ def read_people(folder: Path) -> list[MeetingPerson]:
     return people
 
 
+def interval_table(spans: Iterable[Sequence[float]]) -> Doubles:
+    """Return (K, 2) of pairs (start, end)."""
+    return np.array(list(spans), np.float64).reshape(-1, 2)
+
+
 def phrases(spans: Iterable[tuple[float, float]]) -> Doubles:
     """Return spans (K, 2) by start from spans in any order, overlapping ones and gaps under 0.2 s joined."""
     joined: list[list[float]] = []
@@ -143,12 +147,12 @@ def phrases(spans: Iterable[tuple[float, float]]) -> Doubles:
             joined[-1][1] = max(joined[-1][1], end)
         elif end > start:
             joined.append([start, end])
-    return np.array(joined, np.float64).reshape(-1, 2)
+    return interval_table(joined)
 
 
 def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
     """Return the words (K, 2) of one person under 0.6 s with 0.5 s of silence on both sides."""
-    spans = np.array(sorted(words), np.float64).reshape(-1, 2)
+    spans = interval_table(sorted(words))
     before = spans[:, 0] - np.r_[-np.inf, spans[:-1, 1]]
     after = np.r_[spans[1:, 0], np.inf] - spans[:, 1]
     short = spans[:, 1] - spans[:, 0] < _SHORT_S
@@ -178,17 +182,14 @@ def _spoken(spans: Iterable[LabelledSpan]) -> list[tuple[float, float]]:
 
 
 def _pick(spans: Iterable[LabelledSpan], wanted: tuple[str, ...]) -> Doubles:
-    return np.array([(start, end) for start, end, what in spans if what in wanted], np.float64).reshape(-1, 2)
+    return interval_table((start, end) for start, end, what in spans if what in wanted)
 
 
-def _spans(folder: Path, name: str, *what: str) -> _Spans:
-    rows = _table(folder, name)
+def _spans(folder: Path, name: str) -> _Spans:
     spans: _Spans = defaultdict(list)
     try:
-        for meeting, agent, start, end, *rest in zip(
-            *(rows[column] for column in ("meeting", "agent", "start_s", "end_s", *what)), strict=True
-        ):
-            spans[meeting, agent].append((float(start), float(end), " ".join(rest)))
+        for meeting, agent, start, end, *what in _table(folder, name):
+            spans[meeting, agent].append((float(start), float(end), " ".join(what)))
     except ValueError as error:
         raise ConfigError(f"{folder}: {name}: {error}") from error
     for found in spans.values():
@@ -196,7 +197,8 @@ def _spans(folder: Path, name: str, *what: str) -> _Spans:
     return spans
 
 
-def _table(folder: Path, name: str) -> _Rows:
+def _table(folder: Path, name: str) -> list[tuple[str, ...]]:
+    """Return the rows of a table, of each the `_COLUMNS`. Raises ConfigError."""
     for file in (folder / f"{name}.csv.gz", folder / f"{name}.csv"):
         if file.is_file():
             break
@@ -206,4 +208,4 @@ def _table(folder: Path, name: str) -> _Rows:
     for column in _COLUMNS[name]:
         if column not in rows:
             raise ConfigError.at(file, "column", column, "is missing", rows)
-    return rows
+    return list(zip(*(rows[column] for column in _COLUMNS[name]), strict=True))

@@ -21,7 +21,7 @@ the filmed recordings themselves (`speaking.py`). Each is a separate data set, i
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -30,15 +30,15 @@ from typing import Final, Literal
 
 import numpy as np
 
+from sfms_robot.app.progress import Progress, no_progress
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Bools, Doubles, Floats
-from sfms_robot.lab.corpora import conversational_states as labels
-from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
+from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save, states_of
 from sfms_robot.lab.corpora.compose import speaking
-from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson, read_people, split_series
+from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson, interval_table, read_people, split_series
 from sfms_robot.lab.corpora.compose.motions import Rng, first_frame, pick
-from sfms_robot.lab.corpora.compose.render_events import NO_SPANS, Score, act, speaker_motion
+from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import (
     VOICE_FOLDERS,
@@ -61,8 +61,8 @@ LENGTH_S: Final = (30.0, 60.0)
 HELD_OUT_SHARE: Final = 1 / 6  # of the training minutes, for validation and for test
 Scene = Literal["listening", "interaction"]
 SetName = Scene | Literal["speaking"]
-# Minutes of the sets that speak, per minute of listening.
-SHARES: Final[Mapping[SetName, float]] = {"interaction": 0.5, "speaking": 0.25}
+# Minutes of each set, per minute of listening.
+SHARES: Final[Mapping[SetName, float]] = {"listening": 1.0, "interaction": 0.5, "speaking": 0.25}
 _FILMED: Final = 0.4  # share of dyads with a voice whose mouth was recorded
 _FACELESS: Final = 0.25  # share of those in which the speaker is heard only
 _FLOOR_S: Final = 1.0  # a shorter phrase does not take the floor
@@ -118,25 +118,12 @@ class Material:
     dwell: Dwell
 
 
-def read_material(ami: Path, voices: Sequence[Path], motions: Path) -> dict[Split, Material]:
-    """Read material by split, from AMI tables, folders of voices and a file of primitives. Raises ConfigError."""
-    people = split_series(read_people(ami))
-    spoken, laughter, moves = split_voices(find_voices(voices)), find_laughter(voices), read_motions(motions)
-    dwell = learn_dwell(people["train"])
-    return {
-        split: Material(
-            people=people[split], voices=spoken[split], laughter=laughter[split], motions=moves[split], dwell=dwell
-        )
-        for split in SPLITS
-    }
-
-
 def compose_folder(
     data: Path,
     out: Path,
     seed: int,
     minutes: float,
-    told: Callable[[str, float, float], None] | None = None,
+    moved: Progress = no_progress,
     overwrite: bool = False,
     jobs: int = 1,
 ) -> dict[str, float]:
@@ -147,28 +134,27 @@ def compose_folder(
 
     Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
     ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused, or, with `overwrite`, removed
-    from `out` once the new ones are written: two sets never mix. `told` is called after every dyad, with the set, the
-    minutes wanted of it and the minutes written. `jobs`: processes; each part, a split of a set, has its own random
+    from `out` once the new ones are written: two sets never mix. `moved` is called after every dyad, with the
+    minutes written of its set and those wanted. `jobs`: processes; each part, a split of a set, has its own random
     numbers, so the files are the same with any number. Returns the minutes written per split. Raises ConfigError.
     """
-    folders: dict[SetName, Path] = {"listening": out, **{name: out / name for name in SHARES}}
     parts = [
-        Part(name, split, folder, SHARES.get(name, 1.0) * minutes)
-        for name, folder in folders.items()
+        Part(name, split, (out if name == "listening" else out / name) / split, share * minutes)
+        for name, share in SHARES.items()
         for split in SPLITS
     ]
-    if not overwrite and (earlier := sorted(file for folder in folders.values() for file in _composed(folder))):
+    if not overwrite and (earlier := sorted(_composed(parts))):
         raise ConfigError(
             f"--out {out}: holds dyads already, {earlier[0].name} among {len(earlier)}: another folder, or --overwrite"
         )
     written: dict[Part, dict[Path, float]] = {part: {} for part in parts}
-    done = dict.fromkeys(folders, 0.0)
+    done = dict.fromkeys(SHARES, 0.0)
     for part, file, minute in _written(data, parts, seed, jobs):
         written[part][file] = minute
         done[part.name] += minute
-        if told:
-            told(part.name, part.minutes * (1 + 2 * HELD_OUT_SHARE), done[part.name])
-    for stale in {file for folder in folders.values() for file in _composed(folder)}.difference(*written.values()):
+        wanted = part.minutes * (1 + 2 * HELD_OUT_SHARE)
+        moved(done[part.name], wanted, f"{part.name}, {done[part.name]:.0f} of {wanted:.0f} minutes")
+    for stale in _composed(parts).difference(*written.values()):
         stale.unlink()
     return {
         part.split if part.name == "listening" else f"{part.name}_{part.split}": sum(files.values())
@@ -178,25 +164,25 @@ def compose_folder(
 
 @dataclass(frozen=True)
 class Part:
-    """A split of a set, the folder of the set, and the minutes wanted of its training split."""
+    """A split of a set, its folder, and the minutes wanted of the training split."""
 
     name: SetName
     split: Split
     folder: Path
     minutes: float
 
-    def write(self, material: Mapping[Split, Material], seed: int) -> Iterator[tuple[Part, Path, float]]:
+    def write(self, data: Path, seed: int) -> Iterator[tuple[Part, Path, float]]:
         """Write the dyads of the part; yield the file and minutes of each."""
-        for dyad in dyads(material, self.name, self.split, seed, self.minutes):
-            save(self.folder / self.split, [dyad])
-            yield self, self.folder / self.split / f"{dyad.name}.npz", len(dyad.listener) * FRAME_S / 60
+        for dyad in dyads(material_of(data), self.name, self.split, seed, self.minutes):
+            save(self.folder, [dyad])
+            yield self, self.folder / f"{dyad.name}.npz", len(dyad.listener) * FRAME_S / 60
 
 
 def _written(data: Path, parts: Sequence[Part], seed: int, jobs: int) -> Iterator[tuple[Part, Path, float]]:
     """Yield each dyad once it is written: its part, file and minutes; with several jobs, part by part."""
     if jobs == 1:
         for part in parts:
-            yield from part.write(material_of(data), seed)
+            yield from part.write(data, seed)
         return
     with process_pool(min(jobs, len(parts))) as pool:
         largest = sorted(parts, key=lambda part: (part.split != "train", -part.minutes))
@@ -206,21 +192,29 @@ def _written(data: Path, parts: Sequence[Part], seed: int, jobs: int) -> Iterato
 
 def _whole_part(data: Path, part: Part, seed: int) -> list[tuple[Part, Path, float]]:
     """Write a part, in a process of a pool."""
-    return [*part.write(material_of(data), seed)]
+    return [*part.write(data, seed)]
 
 
 @lru_cache(maxsize=1)
 def material_of(data: Path) -> dict[Split, Material]:
-    """Return the material in a folder, and the bundled, read once. Raises ConfigError."""
+    """Return the material by split, in a folder and bundled: AMI tables, voices, primitives. Raises ConfigError."""
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
     brought = [folder for folder in (*(data / name for name in VOICE_FOLDERS), ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
-    return read_material(ami, [*bundled, *brought], data_dir("sim") / "listeners" / "motions.npz")
+    people, folders = split_series(read_people(ami)), [*bundled, *brought]
+    voices, laughter = split_voices(find_voices(folders)), find_laughter(folders)
+    motions, dwell = read_motions(data_dir("sim") / "listeners" / "motions.npz"), learn_dwell(people["train"])
+    return {
+        split: Material(
+            people=people[split], voices=voices[split], laughter=laughter[split], motions=motions[split], dwell=dwell
+        )
+        for split in SPLITS
+    }
 
 
-def _composed(out: Path) -> set[Path]:
-    """Return every dyad that a run has written to a folder of splits."""
-    return {file for split in SPLITS for pattern in _FILES for file in (out / split).glob(pattern)}
+def _composed(parts: Sequence[Part]) -> set[Path]:
+    """Return every dyad that a run has written to the folders of these parts."""
+    return {file for part in parts for pattern in _FILES for file in part.folder.glob(pattern)}
 
 
 def dyads(material: Mapping[Split, Material], name: SetName, split: Split, seed: int, minutes: float) -> Iterator[Dyad]:
@@ -265,9 +259,9 @@ def stretches(people: Sequence[MeetingPerson], rng: Rng, scene: Scene = "listeni
     """
     found = []
     for person in people:
-        at = float(rng.uniform(0, LENGTH_S[0]))
+        at = rng.uniform(0, LENGTH_S[0])
         while at + LENGTH_S[1] < person.until_s:
-            length = FRAME_S * round(float(rng.uniform(*LENGTH_S)) * FRAME_HZ)
+            length = FRAME_S * round(rng.uniform(*LENGTH_S) * FRAME_HZ)
             piece = Stretch(person=person, start_s=at, end_s=at + length)
             at += length
             own, others = (active(spans, piece) for spans in (person.talk, person.others))
@@ -299,7 +293,7 @@ def choose(found: Sequence[Stretch], minutes: float, rng: Rng) -> list[Stretch]:
         chances = chances / chances.sum()
     spots = np.floor(np.cumsum(chances) + rng.random())
     drawn = np.flatnonzero(np.diff(spots, prepend=0.0) >= 1)
-    return [ranked[int(index)] for index in rng.permutation(drawn)]
+    return [ranked[index] for index in rng.permutation(drawn)]
 
 
 def _chances(weights: Doubles, lengths: Doubles, wanted: float) -> Doubles:
@@ -339,19 +333,12 @@ def compose_one(stretch: Stretch, material: Material, rng: Rng) -> Dyad:
         ends=phrase_ends(others, FRAME_HZ),
         mouth=mouth,
     )
-    feedback = labels.Voices(
-        own,
-        others,
-        active(person.backchannels, stretch),
-        active(person.others_backchannels, stretch),
-        active(person.nods, stretch),
-    )
     smiling = rng.spawn(1)[0]
     smiles = sizes.others_smiles(frames * FRAME_S, smiling)
     audio, face = speaker_of(stretch, voice, material.motions, rng, material.laughter, smiles)
     faced = np.asarray(np.isfinite(face).all(axis=1))
     seen_smiles = smiles[faced[(smiles[:, 0] * FRAME_HZ).astype(int)]]
-    acted = act(replace(score, smiles=sizes.returned(seen_smiles, smiling)), material.motions, rng)
+    acted = act(score._replace(smiles=sizes.returned(seen_smiles, smiling)), material.motions, rng)
     return Dyad(
         name=stretch.name,
         audio=audio,
@@ -359,7 +346,11 @@ def compose_one(stretch: Stretch, material: Material, rng: Rng) -> Dyad:
         listener=acted.motion,
         listening=listening_mask(others, FRAME_HZ, own),
         agent_audio=said,
-        states=labels.label(feedback),
+        states=states_of(
+            own,
+            others,
+            *(active(each, stretch) for each in (person.backchannels, person.others_backchannels, person.nods)),
+        ),
         events=acted.events,
         head_of_gaze_rad=acted.head_of_gaze_rad,
         attention=np.where(faced, attention_of(stretch), np.nan).astype(np.float32),
@@ -377,8 +368,8 @@ def speaker_of(
     voice: VoiceClip,
     motions: Motions,
     rng: Rng,
-    laughter: Sequence[Floats] = (),
-    smiles: Doubles = NO_SPANS,
+    laughter: Sequence[Floats],
+    smiles: Doubles,
 ) -> tuple[Floats, Floats]:
     """Return sound and face of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen.
 
@@ -414,7 +405,7 @@ def attention_of(stretch: Stretch) -> Floats:
 
 def spans_by(told: Sequence[LabelledSpan], agent: str | None = None) -> Doubles:
     """Return spans (K, 2) of what one agent did, or all."""
-    return np.array([(a, b) for a, b, who in told if agent in (None, who)], np.float64).reshape(-1, 2)
+    return interval_table((a, b) for a, b, who in told if agent in (None, who))
 
 
 def _looks(stretch: Stretch, dwell: Dwell, rng: Rng) -> tuple[LabelledSpan, ...]:

@@ -40,8 +40,8 @@ def tiled(pieces: Sequence[Floats], frames: int, rng: Rng, fade: int = FADE) -> 
     out = np.zeros((total, usable[0].shape[1]), np.float32)
     at = 0
     while at < total:
-        piece = usable[rng.integers(len(usable))]
-        piece = piece[int(rng.integers(0, max(1, (len(piece) - 2 * fade) // 2))) :]
+        piece = pick(usable, rng)
+        piece = piece[rng.integers(0, max(1, (len(piece) - 2 * fade) // 2)) :]
         piece = piece * edges(len(piece), fade)[:, None]
         out[at : at + len(piece)] += piece[: total - at]
         at += len(piece) - fade

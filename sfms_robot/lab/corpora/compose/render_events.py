@@ -7,9 +7,9 @@ when and how large, comes back as events. Nothing else of their kind is put ther
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -55,14 +55,10 @@ _TURNED: Final = [CHANNEL_INDEX[name] for name in LATERAL_POSE]
 
 
 NO_SPANS: Final = np.zeros((0, 2))
+NEVER: Final = np.zeros(0)
 
 
-def _spans(width: int = 2) -> Doubles:
-    return np.zeros((0, width))
-
-
-@dataclass(frozen=True, kw_only=True)
-class Score:
+class Score(NamedTuple):
     """Events within `frames` frames, in seconds from their beginning; spans are (K, 2) start, end.
 
     Attributes:
@@ -76,18 +72,18 @@ class Score:
     """
 
     frames: int
-    nods: Doubles = field(default_factory=_spans)
-    shakes: Doubles = field(default_factory=_spans)
-    tilts: Doubles = field(default_factory=_spans)
-    laughs: Doubles = field(default_factory=_spans)
-    talk: Doubles = field(default_factory=_spans)
-    backchannels: Doubles = field(default_factory=_spans)
-    mm_hms: Doubles = field(default_factory=_spans)
+    nods: Doubles = NO_SPANS
+    shakes: Doubles = NO_SPANS
+    tilts: Doubles = NO_SPANS
+    laughs: Doubles = NO_SPANS
+    talk: Doubles = NO_SPANS
+    backchannels: Doubles = NO_SPANS
+    mm_hms: Doubles = NO_SPANS
     gaze: tuple[tuple[float, float, str], ...] = ()
-    shared_laughs: Doubles = field(default_factory=_spans)
-    smiles: Doubles = field(default_factory=lambda: _spans(3))
-    asked: Doubles = field(default_factory=lambda: np.zeros(0))
-    ends: Doubles = field(default_factory=lambda: np.zeros(0))
+    shared_laughs: Doubles = NO_SPANS
+    smiles: Doubles = NO_SPANS
+    asked: Doubles = NEVER
+    ends: Doubles = NEVER
     mouth: Floats | None = None
 
 
@@ -126,7 +122,7 @@ def speaker_motion(
     mouth: Floats,
     motions: Motions,
     rng: Rng,
-    attention: Floats | None = None,
+    attention: Floats,
     laughs: Doubles = NO_SPANS,
     nods: Doubles = NO_SPANS,
     smiles: Doubles = NO_SPANS,
@@ -148,9 +144,8 @@ def speaker_motion(
     for start, end, size in smiles.tolist():
         lay_smile(shapes, start, end - start, size, 0.1, motions, rng)
     np.clip(shapes, 0, 1, out=shapes)
-    known = np.full(len(mouth), np.nan, np.float32) if attention is None else attention
     seed = int(rng.integers(2**31))
-    _look(motion, _speaker_targets(known, rng), seed)
+    _look(motion, _speaker_targets(attention, rng), seed)
     return mirrored(motion) if rng.random() < 0.5 else motion
 
 
@@ -195,51 +190,38 @@ def _talking_head(score: Score, motions: Motions, rng: Rng) -> Floats:
     return np.asarray(eased * rng.uniform(0.2, 0.4) * tiled(motions.heads, score.frames, rng), np.float32)
 
 
-@dataclass(frozen=True)
-class NodHabit:
-    """Nods of one person: the usual size [rad, peak to peak], and the pace of the swings."""
-
-    size_rad: float
-    pace_hz: float
-
-
-@dataclass(frozen=True)
-class NodManner:
-    """One nod: size [rad, peak to peak] of its first swing, how many swings, how long all take, how they die away."""
-
-    size_rad: float
-    swings: int
-    duration_s: float
-    fall: float
-
-
-def nod_habit(rng: Rng) -> NodHabit:
-    """Draw the habit of a person: about 5 degrees, 1.8 to 3 swings a second."""
+def nod_habit(rng: Rng) -> tuple[float, float]:
+    """Draw how a person nods: the usual size, about 5 degrees [rad, peak to peak], and 1.8 to 3 swings a second."""
     usual = sizes.NOD_DEG[1]
     size = np.deg2rad(rng.normal(usual, usual * sizes.HABIT_SPREAD))
-    return NodHabit(float(size), float(rng.uniform(*sizes.SWINGS_HZ)))
+    return float(size), rng.uniform(*sizes.SWINGS_HZ)
 
 
-def nod_manner(habit: NodHabit, length_s: float, rng: Rng) -> NodManner:
-    """Return swings, rate and size of a nod of about this duration: 1 to 4 swings of 1.5 to 3.3 Hz, 2.2 to 12
-    degrees.
+def nod_of(kind: str, start_s: float, length_s: float, habit: tuple[float, float], rng: Rng) -> ListenerEvent:
+    """Return a nod of about this duration: 1 to 4 swings of 1.5 to 3.3 Hz, the first of 2.2 to 12 degrees.
+
+    `habit`: of `nod_habit`.
     """
-    swings, lasts_s = sizes.swings(length_s, habit.pace_hz)
+    usual_rad, pace_hz = habit
+    swings, lasts_s = sizes.swings(length_s, pace_hz)
     least, _, most = np.deg2rad(sizes.NOD_DEG)
-    size = np.clip(habit.size_rad * np.exp(rng.normal(0, sizes.NOD_SPREAD)), least, most)
-    return NodManner(float(size), swings, lasts_s, float(rng.uniform(0.65, 0.95)))
+    size = np.clip(usual_rad * np.exp(rng.normal(0, sizes.NOD_SPREAD)), least, most)
+    return ListenerEvent(kind, start_s, lasts_s, float(size), swings)
 
 
-def nod_curve(manner: NodManner, shape: Floats, start_s: float, frames: int) -> Floats:
-    """Return nose down [rad] (frames,) of a nod from `start_s` on, smaller where a neck could not follow."""
+def nod_curve(nod: ListenerEvent, fall: float, shape: Floats, frames: int) -> Floats:
+    """Return nose down [rad] (frames,) of a nod, smaller where a neck could not follow.
+
+    `fall`: the size of each swing over that of the one before.
+    """
     out = np.zeros(frames)
-    each_s = manner.duration_s / manner.swings
-    size = min(manner.size_rad, NOD_RAD_S2 * each_s**2 / max(_bend(shape, each_s), 1.0))
-    low, high = max(0, first_frame(start_s) - 1), min(frames, first_frame(start_s + manner.duration_s) + 2)
-    times = np.arange(low + 1, high + 1) * FRAME_S - start_s
-    for swing in range(manner.swings):
+    each_s = nod.duration_s / nod.swings
+    size = min(nod.size, NOD_RAD_S2 * each_s**2 / max(_bend(shape, each_s), 1.0))
+    low, high = max(0, first_frame(nod.start_s) - 1), min(frames, first_frame(nod.start_s + nod.duration_s) + 2)
+    times = np.arange(low + 1, high + 1) * FRAME_S - nod.start_s
+    for swing in range(nod.swings):
         phase = times / each_s - swing
-        out[low:high] += size * manner.fall**swing * np.interp(phase, np.linspace(0, 1, len(shape)), shape, 0, 0)
+        out[low:high] += size * fall**swing * np.interp(phase, np.linspace(0, 1, len(shape)), shape, 0, 0)
     return out.astype(np.float32)
 
 
@@ -249,14 +231,12 @@ def _swing(
     """Add nods or shakes to a pose (N, 6)."""
     habit, events = nod_habit(rng), []
     for start, end in spans.tolist():
-        manner = nod_manner(habit, end - start, rng)
-        if kind == "nod":
-            curve = nod_curve(manner, pick(motions.nods, rng), start, len(pose))
-            pose[:, 1] += curve
-        else:
-            curve = sizes.SHAKE * nod_curve(manner, pick(motions.shakes, rng), start, len(pose))
-            pose[:, 2] += rng.choice([-1, 1]) * curve
-        events.append(ListenerEvent(kind, start, manner.duration_s, float(np.ptp(curve)), manner.swings))
+        nod, fall = nod_of(kind, start, end - start, habit, rng), rng.uniform(0.65, 0.95)
+        curve = nod_curve(nod, fall, pick(motions.nods if kind == "nod" else motions.shakes, rng), len(pose))
+        if kind == "shake":
+            curve = rng.choice([-1, 1]) * (sizes.SHAKE * curve)
+        pose[:, 1 if kind == "nod" else 2] += curve
+        events.append(replace(nod, size=float(np.ptp(curve))))
     return events
 
 
@@ -322,7 +302,7 @@ def _speaker_targets(attention: Floats, rng: Rng) -> Floats:
     """Return where a speaker looks, (N, 2): at the listener or not as given, at random where not known."""
     at_listener = attention > 0.5
     unknown = np.isnan(attention)
-    looks, row = bool(rng.random() < 0.6), 0
+    looks, row = rng.random() < 0.6, 0
     while row < len(attention):
         long = max(5, int(FRAME_HZ * 1.5 * np.exp(rng.normal(0, 0.7))))
         at_listener[row : row + long] |= unknown[row : row + long] & looks
@@ -420,7 +400,7 @@ def _speak(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[Lis
     for start, end in score.talk if score.mouth is None else ():
         length = max(4, int((end - start) * FRAME_HZ))
         gain = rng.uniform(*sizes.MM_HM) if any(abs(start - other) < 0.3 for other in short) else rng.uniform(0.6, 0.9)
-        offset = int(rng.integers(max(1, len(source) - length)))
+        offset = rng.integers(max(1, len(source) - length))
         piece = source[offset : offset + length]
         said = said + placed((gain * piece * edges(len(piece), 3)[:, None]).astype(np.float32), start, len(shapes))
     np.copyto(shapes, over(shapes, said))

@@ -13,9 +13,8 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats
-from sfms_robot.lab.corpora import conversational_states as labels
-from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson
+from sfms_robot.lab.corpora.clips import Dyad, states_of_activity
+from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson, interval_table
 from sfms_robot.lab.corpora.compose.motions import Rng, pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, room
@@ -39,7 +38,7 @@ def dyads(
     rng = np.random.default_rng(seed)
     frames, count = minutes * 60 * FRAME_HZ, 0
     while filmed and frames > 0:
-        voice = filmed[int(rng.choice(len(filmed), p=weights / weights.sum()))]
+        voice = filmed[rng.choice(len(filmed), p=weights / weights.sum())]
         dyad = take(f"speaking_{voice.name}_{count:03d}", voice, motions, dwell, rng)
         yield dyad
         frames, count = frames - len(dyad.listener), count + 1
@@ -51,12 +50,12 @@ def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: Rng) 
         raise ValueError(f"{voice.name} was not filmed")
     whole = min(len(voice.recording) // FRAME_SAMPLES, len(voice.mouth) - 1)
     frames = min(int(rng.uniform(*LENGTH_S) * FRAME_HZ), whole)
-    first = int(rng.integers(whole - frames + 1))
+    first = rng.integers(whole - frames + 1)
     said = voice.recording[first * FRAME_SAMPLES : (first + frames) * FRAME_SAMPLES]
     active = voice_activity(said)
     score = Score(
         frames=frames,
-        talk=np.array(runs(active), np.float64).reshape(-1, 2) * FRAME_S,
+        talk=interval_table(runs(active)) * FRAME_S,
         gaze=dwell.looks(frames * FRAME_S, rng),
         ends=phrase_ends(active, FRAME_HZ),
         mouth=voice.mouth[first + 1 : first + frames + 1],  # a frame shows the face at its end
@@ -71,7 +70,7 @@ def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: Rng) 
         listener=acted.motion,
         listening=silent,
         agent_audio=sent(said, rng),
-        states=labels.label(labels.of_activity(active, silent)),
+        states=states_of_activity(active, silent),
         events=acted.events,
         head_of_gaze_rad=acted.head_of_gaze_rad,
         attention=np.full(frames, np.nan, np.float32),
@@ -111,7 +110,7 @@ class Dwell:
         found: list[LabelledSpan] = []
         if not self.at_s or not self.away:
             return ()
-        at = float(rng.uniform(0, 1)) * pick(self.at_s, rng)
+        at = rng.uniform(0, 1) * pick(self.at_s, rng)
         while at < length_s:
             lasts_s, where = pick(self.away, rng)
             found.append((at, min(at + lasts_s, length_s), where))

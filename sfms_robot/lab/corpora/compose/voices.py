@@ -19,8 +19,8 @@ from scipy.signal import oaconvolve
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Bools, Doubles, Floats
 from sfms_robot.lab.corpora.clips import SPLITS, Split, by_split, split_of_voice
+from sfms_robot.lab.corpora.collection import columns
 from sfms_robot.lab.corpora.compose.motions import SHAPE, Rng, pick
-from sfms_robot.lab.corpora.reading import columns
 from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.events import runs
@@ -214,19 +214,14 @@ def facegood_mouth(file: Path) -> Floats:
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"{file}: not a file of mouth weights: {error}") from error
     shapes = np.zeros((len(weights), len(BLENDSHAPES)), np.float32)
-    for column, name in enumerate(str(name) for name in names):
-        for channel, gain in _channels_of(name):
-            shapes[:, SHAPE[channel]] = np.maximum(shapes[:, SHAPE[channel]], gain * weights[:, column])
+    for control, values in zip(names.tolist(), weights.T, strict=True):
+        side = {"_l": "Left", "_r": "Right"}.get(control[-2:], "")
+        for channel, controls in FACEGOOD.items():
+            at = SHAPE.get(channel, SHAPE.get(channel + side))
+            for prefix, gain in controls:
+                if at is not None and control.startswith(prefix):
+                    shapes[:, at] = np.maximum(shapes[:, at], gain * values)
     return at_25_hz(np.arange(len(shapes)) / fps, np.clip(shapes, 0, 1))
-
-
-def _channels_of(control: str) -> list[tuple[str, float]]:
-    side = {"_l": "Left", "_r": "Right"}.get(control[-2:], "")
-    found = []
-    for channel, controls in FACEGOOD.items():
-        name = channel if channel in SHAPE else channel + side
-        found += [(name, gain) for prefix, gain in controls if name in SHAPE and control.startswith(prefix)]
-    return found
 
 
 def at_25_hz(times_s: NDArray[np.floating], values: Floats) -> Floats:
@@ -247,13 +242,13 @@ def lay(segments_s: Doubles, frames: int, voice: VoiceClip, rng: Rng) -> tuple[F
     """Fill talk segments (K, 2), seconds from 0, with a voice: audio (frames * 640,), mouth (frames, 52) or None."""
     audio = np.zeros(frames * FRAME_SAMPLES, np.float32)
     mouth = None if voice.mouth is None else np.zeros((frames, len(SHAPE)), np.float32)
-    last = int(rng.integers(len(voice.ends)))
+    last = rng.integers(len(voice.ends))
     for start_s, end_s in segments_s:
         start, end = (int(np.clip(round(t * AUDIO_HZ), 0, len(audio))) for t in (start_s, end_s))
         if end - start < 2 * _FADE:
             continue
         # Recordings go on where they were, a phrase or two further: the same words do not come at once again.
-        last = (last + int(rng.integers(1, 4))) % len(voice.ends)
+        last = (last + rng.integers(1, 4)) % len(voice.ends)
         index = np.arange(voice.ends[last] - (end - start), voice.ends[last]) % len(voice.audio)
         audio[start:end] = _eased(voice.audio[index] * np.float32(rng.uniform(0.8, 1.25)))
         if mouth is not None and voice.mouth is not None:
@@ -297,7 +292,7 @@ def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: Rng) ->
     It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.
     """
     source = pick(talk, rng)
-    piece = np.roll(source, int(rng.integers(len(source))), axis=0)[np.arange(frames) % len(source)]
+    piece = np.roll(source, rng.integers(len(source)), axis=0)[np.arange(frames) % len(source)]
     power = uniform_filter1d(speech[: frames * FRAME_SAMPLES].astype(np.float64) ** 2, 3 * FRAME_SAMPLES)
     level_db = 10 * np.log10(power[FRAME_SAMPLES - 1 :: FRAME_SAMPLES] + 1e-10)
     open_share = np.clip((level_db - 20 * np.log10(_LEVEL) + 26) / 20, 0, 1)

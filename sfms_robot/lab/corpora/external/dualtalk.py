@@ -21,8 +21,21 @@ import numpy as np
 
 from sfms_robot.frames import POSE, SHAPES, Floats, reorder
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, attempt
-from sfms_robot.lab.corpora.reading import dyad_of, existing, frames_of, npy, npz, npz_shapes, track, voices_of
+from sfms_robot.lab.corpora.collection import (
+    Clip,
+    ClipError,
+    Found,
+    Layout,
+    attempt,
+    dyad_of,
+    existing,
+    frames_of,
+    npy,
+    npz,
+    npz_shapes,
+    track,
+    voices_of,
+)
 
 FPS: Final = 25.0
 LICENCE: Final = "Apache 2.0, as its README says; made from RealTalk"
@@ -53,9 +66,9 @@ def _flame_shape(file: Path) -> tuple[int, ...]:
     shapes = npz_shapes(file)
     for key, width in PARTS.items():
         if key not in shapes:
-            raise ClipError.of("missing half", file, f"has no {key}, only {', '.join(shapes)}")
+            raise ClipError("missing half", file, f"has no {key}, only {', '.join(shapes)}")
         if len(shapes[key]) < 2 or shapes[key][-1] != width:
-            raise ClipError.of("wrong dims", file, f"{key} has shape {shapes[key]}, expected (T, {width})")
+            raise ClipError("wrong dims", file, f"{key} has shape {shapes[key]}, expected (T, {width})")
     return shapes["exp"]
 
 
@@ -67,7 +80,7 @@ def _flame_rows(file: Path, frames: int, gaps: bool) -> Floats:
 def _arkit_shape(file: Path) -> tuple[int, ...]:
     shape = npy(file).shape
     if len(shape) != 2 or shape[1] != ARKIT_WIDTH:
-        raise ClipError.of("wrong dims", file, f"shape {shape}, expected (T, {ARKIT_WIDTH})")
+        raise ClipError("wrong dims", file, f"shape {shape}, expected (T, {ARKIT_WIDTH})")
     return shape
 
 
@@ -89,15 +102,11 @@ def splits(place: Path) -> Mapping[str, str]:
     return {split: split for split in (*SPLITS, DEMO) if FLAME.people(place / split)} or ({DEMO: "."} if demo else {})
 
 
-def arkit_splits(place: Path) -> Mapping[str, str]:
-    return {split: split for split in SPLITS if ARKIT.people(place / ARKIT_FOLDER / split)}
-
-
-def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def scan(place: Path, split: str) -> Iterator[Found]:
     return _found(split, place / split, place / split, FLAME)
 
 
-def arkit_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def arkit_scan(place: Path, split: str) -> Iterator[Found]:
     voices = next((base for base in (place, place / "DualTalk_Dataset") if (base / split).is_dir()), place)
     return _found(split, voices / split, place / ARKIT_FOLDER / split, ARKIT)
 
@@ -136,5 +145,6 @@ LAYOUT: Final = Layout(
 ARKIT_LAYOUT: Final = Layout(
     name="dualtalk_arkit",
     about="DualTalk in ARKit's shapes: ARKit_npy/{train,test,ood}/<id>_speaker{1,2}.npy beside its .wav",
-    space="arkit58", fps=FPS, splits=arkit_splits, scan=arkit_scan, held_out=0.1, licence=LICENCE,
+    splits=lambda place: {split: split for split in SPLITS if ARKIT.people(place / ARKIT_FOLDER / split)},
+    space="arkit58", fps=FPS, scan=arkit_scan, held_out=0.1, licence=LICENCE,
 )  # fmt: skip

@@ -25,8 +25,21 @@ from numpy.typing import ArrayLike
 
 from sfms_robot.frames import Doubles, Floats
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, attempt, guarded
-from sfms_robot.lab.corpora.reading import dyad_of, frames_of, npy, numbers, pose_last, torch_load, track
+from sfms_robot.lab.corpora.collection import (
+    WITH_VAL,
+    Clip,
+    ClipError,
+    Found,
+    Layout,
+    attempt,
+    dyad_of,
+    frames_of,
+    guarded,
+    npy,
+    numbers,
+    torch_load,
+    track,
+)
 from sfms_robot.signals.mel import FLOOR, LN_PER_DB, MEL_BINS, ROWS_PER_FRAME
 
 FPS: Final = 30.0
@@ -47,22 +60,18 @@ def _subjects(place: Path) -> list[Path]:
     return found if any(map(_is_subject, found)) else []
 
 
-def splits(place: Path) -> Mapping[str, str]:
-    return {split: split for split in ("train", "test") if any((one / split).is_dir() for one in _subjects(place))}
-
-
-def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def scan(place: Path, split: str) -> Iterator[Found]:
     for subject in _subjects(place):
         if subject != place and subject.name == UNUSED:
             yield f"{UNUSED} is left out, as the reference does: give its own folder to use it"
         elif (subject / split).is_dir():
             try:
-                yield from _direction(subject.name, subject / split, pose_first)
+                yield from _direction(subject.name, subject / split)
             except ClipError as error:
                 yield error.problem
 
 
-def _direction(subject: str, folder: Path, pose_first: bool) -> Iterator[Found]:
+def _direction(subject: str, folder: Path) -> Iterator[Found]:
     """Yield the clips of one subject, listened to by the host."""
 
     def file(person: int, role: str, kind: str) -> Path:
@@ -80,32 +89,30 @@ def _direction(subject: str, folder: Path, pose_first: bool) -> Iterator[Found]:
     shapes = [npy(one).shape for one in faces]
     for one, shape in zip(faces, shapes, strict=True):
         if len(shape) != 3 or shape[2] < WIDTH:
-            raise ClipError.of("wrong dims", one, f"shape {shape}, expected (N, T, {WIDTH} or more)")
+            raise ClipError("wrong dims", one, f"shape {shape}, expected (N, T, {WIDTH} or more)")
     count, frames = shapes[1][:2]
     if shapes[0][:2] != (count, frames):
-        raise ClipError.of("lengths differ", folder, f"{shapes[1][:2]} listener clips beside {shapes[0][:2]} speaker's")
+        raise ClipError("lengths differ", folder, f"{shapes[1][:2]} listener clips beside {shapes[0][:2]} speaker's")
     decibels = False
     expected = (count, ROWS_PER_FRAME * frames, MEL_BINS)
     if not sound.is_file():
         yield f"{sound}: no such file: these clips have no sound"
     elif (shape := npy(sound).shape) != expected:
-        raise ClipError.of("wrong dims", sound, f"shape {shape}, expected {expected}")
+        raise ClipError("wrong dims", sound, f"shape {shape}, expected {expected}")
     else:
         decibels = bool(count) and float(np.nanmin(npy(sound)[:: max(1, count // 32)])) < 0
 
     def read(name: str, index: int) -> Dyad:
-        pair = [(f"{one}[{index}]", pose_last(npy(one)[index, :, :WIDTH], pose_first)) for one in faces]
-        mel = _log_mel(sound, index, frames, decibels) if sound.is_file() else None
+        pair = [(f"{one}[{index}]", npy(one)[index, :, :WIDTH]) for one in faces]
+        mel = None
+        if sound.is_file():
+            rows = track(f"{sound}[{index}]", npy(sound)[index], ROWS_PER_FRAME * frames, MEL_BINS)
+            mel = rows * np.float32(LN_PER_DB) if decibels else np.log(np.maximum(rows, 0) + np.float32(FLOOR))
         return dyad_of(name, pair, frames, SPACE, FPS, mel=mel)
 
     for index in range(count):
         name = f"{subject}_{folder.name}_p{host}_{index:05d}"
         yield Clip(name=name, frames=frames, read=partial(read, name, index))
-
-
-def _log_mel(sound: Path, index: int, frames: int, decibels: bool) -> Floats:
-    rows = track(f"{sound}[{index}]", npy(sound)[index], ROWS_PER_FRAME * frames, MEL_BINS)
-    return rows * np.float32(LN_PER_DB) if decibels else np.log(np.maximum(rows, 0) + np.float32(FLOOR))
 
 
 def l2l_mean_std(x: ArrayLike) -> tuple[Doubles, Doubles]:
@@ -124,13 +131,15 @@ def l2l_mean_std(x: ArrayLike) -> tuple[Doubles, Doubles]:
 
 LAYOUT: Final = Layout(
     name="l2l", about="Learning2Listen: {subject}/{train,test}/p{0,1}_*_clean_deca.npy", space=SPACE, fps=FPS,
-    order="exp-first", splits=splits, scan=scan, held_out=0.3,
+    splits=lambda place: {
+        split: split for split in ("train", "test") if any((one / split).is_dir() for one in _subjects(place))
+    },
+    order="exp-first", scan=scan, held_out=0.3,
 )  # fmt: skip
 
 
 # --- lm-listener ----------------------------------------------------------------------------------------------------
 
-SPLITS: Final = {"train": "train", "validation": "val", "test": "test"}
 PEOPLE: Final = ("p1", "p0")  # speaker, listener
 
 
@@ -144,16 +153,12 @@ def _segments(place: Path, split: str) -> list[Path]:
     return [part / name for part in alone if (part / name).is_file()]
 
 
-def lm_splits(place: Path) -> Mapping[str, str]:
-    return {ours: theirs for ours, theirs in SPLITS.items() if _segments(place, theirs)}
-
-
-def lm_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def lm_scan(place: Path, split: str) -> Iterator[Found]:
     for file in _segments(place, split):
         try:
             segments = torch_load(file)
             if not isinstance(segments, list):
-                raise ClipError.of("unreadable", file, "no list of segments")
+                raise ClipError("unreadable", file, "no list of segments")
         except ClipError as error:
             yield error.problem
             continue
@@ -164,10 +169,10 @@ def lm_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
 def _clip(named: tuple[str, Any]) -> Clip:
     name, segment = named
     if not isinstance(segment, dict):
-        raise ClipError.of("unreadable", name, "no dict")
+        raise ClipError("unreadable", name, "no dict")
     keys = [f"{person}_{part}" for person in PEOPLE for part in ("exp", "pose")]
     if missing := [key for key in sorted(keys) if key not in segment]:
-        raise ClipError.of("missing half", name, f"has no {', '.join(missing)}")
+        raise ClipError("missing half", name, f"has no {', '.join(missing)}")
     faces = [(f"{name} {person}", guarded(name, partial(_face, name, segment, person))) for person in PEOPLE]
     frames = frames_of(name, *(rows.shape for _, rows in faces))
     features = {}
@@ -182,11 +187,12 @@ def _face(name: str, segment: Mapping[str, Any], person: str) -> Floats:
     exp, pose = (numbers(segment, f"{person}_{part}") for part in ("exp", "pose"))
     if (exp.shape[-1], pose.shape[-1]) != (50, 6):
         detail = f"exp {exp.shape} and pose {pose.shape}, expected 50 and 6"
-        raise ClipError.of("wrong dims", f"{name} {person}", detail)
+        raise ClipError("wrong dims", f"{name} {person}", detail)
     return np.concatenate([exp, pose], axis=-1).astype(np.float32)
 
 
 LM_LISTENER_LAYOUT: Final = Layout(
     name="lm_listener", about="lm-listener: {subject}/segments_{train,val,test}.pth", space=SPACE, fps=FPS,
-    splits=lm_splits, scan=lm_scan, below=("", "dataset"),
+    splits=lambda place: {ours: theirs for ours, theirs in WITH_VAL.items() if _segments(place, theirs)},
+    scan=lm_scan, below=("", "dataset"),
 )  # fmt: skip

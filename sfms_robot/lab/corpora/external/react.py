@@ -26,14 +26,26 @@ import numpy as np
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, attempt
-from sfms_robot.lab.corpora.reading import dyad_of, existing, frames_of, npy, pose_last, table, track, voices_of
+from sfms_robot.lab.corpora.collection import (
+    WITH_VAL,
+    Clip,
+    ClipError,
+    Found,
+    Layout,
+    attempt,
+    dyad_of,
+    existing,
+    frames_of,
+    npy,
+    table,
+    track,
+    voices_of,
+)
 
 SPACE: Final = "faceverse58"
 FPS, FPS_2025 = 25.0, 30.0
 FRAMES: Final = 750
 ATTRIBUTES: Final = 25  # 15 action units | valence, arousal | 8 expressions
-SPLITS: Final = {"train": "train", "validation": "val", "test": "test"}
 FACES, SOUNDS, EMOTIONS = "3D_FV_files", "Audio_files", "Emotion"
 FACES_2025: Final = "coefficients"
 # The cleaned release names the two people of a chat P1 and P2 in the Emotion tree alone.
@@ -50,10 +62,10 @@ FEATURES_2025: Final[Mapping[str, tuple[str, str, int]]] = {
 
 def splits(faces: str, place: Path) -> Mapping[str, str]:
     """Return the splits that have a folder of faces."""
-    return {ours: theirs for ours, theirs in SPLITS.items() if (place / theirs / faces).is_dir()}
+    return {ours: theirs for ours, theirs in WITH_VAL.items() if (place / theirs / faces).is_dir()}
 
 
-def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def scan(place: Path, split: str) -> Iterator[Found]:
     pairs = _pairs(place / f"{split}.csv")
     folder = place / split
     heard = (folder / SOUNDS).is_dir()
@@ -68,7 +80,7 @@ def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
         frames = min(FRAMES, frames_of(pair[1], *(npy(file).shape for file in faces), slack=1))
         voices = voices_of(*sounds) if heard else []
         name = pair[1].replace("/", "+")
-        read = partial(_read, name, faces, voices, frames, FPS, pose_first)
+        read = partial(_read, name, faces, voices, frames, FPS)
         people = zip(("speaker_attributes", "attributes"), pair, strict=True)
         features = {feature: partial(attributes, folder, person, frames) for feature, person in people}
         return Clip(name=name, frames=frames, read=read, features=features)
@@ -76,7 +88,7 @@ def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
     yield from attempt(pairs + [(listener, speaker) for speaker, listener in pairs], clip)
 
 
-def scan_2025(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def scan_2025(place: Path, split: str) -> Iterator[Found]:
     folder = place / split
     roles = [folder / FACES_2025 / role for role in ("speaker", "listener")]
     heard = (folder / "audio").is_dir()
@@ -92,16 +104,15 @@ def scan_2025(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
             feature: partial(_feature, folder / kind / role / f"{path}.npy", frames, width)
             for feature, (kind, role, width) in FEATURES_2025.items()
         }
-        read = partial(_read, name, faces, voices, frames, FPS_2025, pose_first)
+        read = partial(_read, name, faces, voices, frames, FPS_2025)
         return Clip(name=name, frames=frames, read=read, features=features)
 
     names = {str(file.relative_to(role).with_suffix("")) for role in roles for file in role.rglob("*.npy")}
     yield from attempt(sorted(names), clip)
 
 
-def _read(name: str, faces: Sequence[Path], voices: Sequence[Path], frames: int, fps: float, pose_first: bool) -> Dyad:
-    pair = [(file, pose_last(npy(file), pose_first)) for file in faces]
-    return dyad_of(name, pair, frames, SPACE, fps, voices=voices)
+def _read(name: str, faces: Sequence[Path], voices: Sequence[Path], frames: int, fps: float) -> Dyad:
+    return dyad_of(name, [(file, npy(file)) for file in faces], frames, SPACE, fps, voices=voices)
 
 
 def _pairs(file: Path) -> list[tuple[str, str]]:
@@ -123,7 +134,7 @@ def attributes(folder: Path, clip: str, frames: int) -> Floats:
     try:
         rows = np.loadtxt(file, delimiter=",", skiprows=1, dtype=np.float32, ndmin=2)
     except ValueError as error:
-        raise ClipError.of("unreadable", file, error) from error
+        raise ClipError("unreadable", file, error) from error
     return track(str(file), rows, frames, ATTRIBUTES)
 
 

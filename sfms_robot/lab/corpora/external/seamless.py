@@ -29,8 +29,18 @@ from numpy.typing import NDArray
 
 from sfms_robot.frames import AUDIO_HZ, Bools, Floats
 from sfms_robot.lab.corpora.clips import FAU_VALUE, UNREADABLE, WIDTHS, WITHOUT_SHAPE, WITHOUT_UNIT, Dyad, samples_of
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, Problem, guarded
-from sfms_robot.lab.corpora.reading import frames_of, npz, npz_shapes, track
+from sfms_robot.lab.corpora.collection import (
+    Clip,
+    ClipError,
+    Found,
+    Layout,
+    Problem,
+    frames_of,
+    guarded,
+    npz,
+    npz_shapes,
+    track,
+)
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import AudioFile, read_audio
 from sfms_robot.signals.events import runs
@@ -80,7 +90,7 @@ def splits(place: Path) -> Mapping[str, str]:
     return {ours: theirs for ours, theirs in SPLITS.items() if any(_archives(place, theirs, one) for one in patterns)}
 
 
-def scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def scan(place: Path, split: str) -> Iterator[Found]:
     files, seen = _files(place, split), Counter[str]()
     interactions: dict[str, list[str]] = defaultdict(list)
     for name in files:
@@ -130,7 +140,7 @@ def _clips(
     """Yield both directions: every stretch in which the listener's face is valid."""
     if len(people) != 2:
         problem = "the partner's files are not here" if len(people) == 1 else f"{len(people)} people, not two"
-        raise ClipError.of("missing half", interaction, f"{problem}: {', '.join(name for name, _ in people)}")
+        raise ClipError("missing half", interaction, f"{problem}: {', '.join(name for name, _ in people)}")
     one, two = pair = [_person(*each) for each in people]
     frames = frames_of(interaction, *(each.valid[:, None].shape for each in pair), slack=int(SLACK_S * FPS))
     seen.update(frames=sum(len(each.valid) for each in pair), invalid=sum(int((~each.valid).sum()) for each in pair))
@@ -152,19 +162,21 @@ def _person(name: str, files: Mapping[str, Path]) -> SeamlessPerson:
     for ending in FILES:
         if ending not in files:
             missing = next(iter(files.values())).with_suffix(ending)
-            raise ClipError.of("missing sound" if ending == ".wav" else "missing half", missing, "no such file")
+            raise ClipError("missing sound" if ending == ".wav" else "missing half", missing, "no such file")
     rows, wav = files[".npz"], files[".wav"]
     prefix = _prefix(rows)
     valid = guarded(str(rows), lambda: _valid(rows, prefix))
     spans, seconds = _speech(files[".json"]), len(valid) / FPS
-    sound_s = guarded(str(wav), lambda: _sound_s(wav))
+    sound = guarded(str(wav), partial(AudioFile, wav))
+    sound.close()
+    sound_s = sound.length / AUDIO_HZ
     if abs(sound_s - seconds) > SLACK_S:
-        raise ClipError.of("lengths differ", wav, f"{sound_s:.2f} s of sound for {seconds:.2f} s of face")
+        raise ClipError("lengths differ", wav, f"{sound_s:.2f} s of sound for {seconds:.2f} s of face")
     speaks = np.zeros(len(valid), bool)
     for index, (start_s, end_s) in enumerate(spans):
         if end_s > seconds + SLACK_S:
             detail = f"{VAD}[{index}] ends at {end_s:.2f} s, the interaction at {seconds:.2f} s"
-            raise ClipError.of("time stamps", files[".json"], detail)
+            raise ClipError("time stamps", files[".json"], detail)
         speaks[int(start_s * FPS) : int(np.ceil(end_s * FPS))] = True
     return SeamlessPerson(name=name, npz=rows, wav=wav, prefix=prefix, valid=valid, speaks=speaks)
 
@@ -176,13 +188,13 @@ def _prefix(file: Path) -> str:
     if not complete:
         lacking = ", ".join(f"{PREFIXES[-1]}:{key}" for key in KEYS if f"{PREFIXES[-1]}:{key}" not in shapes)
         held = ", ".join(sorted({key.split(":")[0] for key in shapes})) or "nothing"
-        raise ClipError.of("missing half", file, f"has no {lacking} (only {held}; only vendor V00 has movement)")
+        raise ClipError("missing half", file, f"has no {lacking} (only {held}; only vendor V00 has movement)")
     prefix = complete[0]
     rows = (shapes[f"{prefix}:{ROTATION}"] or ("T",))[0]
     for key, width in KEYS.items():
         shape = shapes[f"{prefix}:{key}"]
         if shape != (rows, width) and (width, shape) != (1, (rows,)):
-            raise ClipError.of("wrong dims", file, f"{prefix}:{key} has shape {shape}, expected ({rows}, {width})")
+            raise ClipError("wrong dims", file, f"{prefix}:{key} has shape {shape}, expected ({rows}, {width})")
     return prefix
 
 
@@ -196,21 +208,15 @@ def _speech(file: Path) -> list[tuple[float, float]]:
         held = json.loads(file.read_text(encoding="utf-8"))
         spans = [(float(one["start"]), float(one["end"])) for one in held[VAD]]
     except (RecursionError, *UNREADABLE) as error:
-        raise ClipError.of("unreadable", file, f"{VAD}: {type(error).__name__}: {error}") from error
+        raise ClipError("unreadable", file, f"{VAD}: {type(error).__name__}: {error}") from error
     before = 0.0
     for index, (start_s, end_s) in enumerate(spans):
         if not 0.0 <= start_s <= end_s < np.inf:
-            raise ClipError.of("time stamps", file, f"{VAD}[{index}] goes from {start_s:g} to {end_s:g} s")
+            raise ClipError("time stamps", file, f"{VAD}[{index}] goes from {start_s:g} to {end_s:g} s")
         if start_s < before:
-            raise ClipError.of("time stamps", file, f"{VAD}[{index}] begins at {start_s:g} s, before the one before it")
+            raise ClipError("time stamps", file, f"{VAD}[{index}] begins at {start_s:g} s, before the one before it")
         before = start_s
     return spans
-
-
-def _sound_s(file: Path) -> float:
-    sound = AudioFile(file)
-    sound.close()
-    return sound.length / AUDIO_HZ
 
 
 def _read(name: str, pair: Sequence[SeamlessPerson], first: int, frames: int, mirrored: bool) -> Dyad:
@@ -218,7 +224,7 @@ def _read(name: str, pair: Sequence[SeamlessPerson], first: int, frames: int, mi
     speaker, listener = (_motion(person, mirrored)[first : first + frames] for person in pair)
     if missing := int((~np.isfinite(listener).all(axis=1)).sum()):
         detail = f"{missing} of {frames} frames from {first} on are zeros and said to be valid"
-        raise ClipError.of("not finite", pair[1].npz, detail)
+        raise ClipError("not finite", pair[1].npz, detail)
     voices, speaks = [], []
     start, wanted = samples_of(first, FPS), samples_of(frames, FPS)
     for person in pair:
@@ -227,7 +233,7 @@ def _read(name: str, pair: Sequence[SeamlessPerson], first: int, frames: int, mi
         speaks.append(person.speaks[first : first + frames])
         if abs(late_s := _lag_s(speaks[-1], voices[-1])) > LARGEST_LAG_S:
             detail = f"the voice comes {late_s:+.2f} s beside {VAD} of {person.name}"
-            raise ClipError.of("time stamps", person.wav, detail)
+            raise ClipError("time stamps", person.wav, detail)
     return Dyad(
         name=name, audio=voices[0], speaker=speaker, listener=listener,
         listening=listening_mask(speaks[0], FPS, speaks[1]), space=SPACE, fps=FPS,

@@ -21,14 +21,18 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Found, Layout, attempt, guarded
-from sfms_robot.lab.corpora.reading import (
+from sfms_robot.lab.corpora.collection import (
+    Clip,
+    ClipError,
+    Found,
+    Layout,
+    attempt,
     dyad_of,
     existing,
     frames_of,
+    guarded,
     npy,
     numbers,
-    pose_last,
     table,
     torch_load,
     track,
@@ -49,7 +53,7 @@ def _rows(file: Path, load: Callable[[Path], Any], key: str) -> NDArray[Any]:
     """Return one array of a pickled dict. Raises ClipError."""
     arrays = guarded(str(existing(file)), lambda: load(file))
     if not isinstance(arrays, dict) or key not in arrays:
-        raise ClipError.of("missing half", file, f"has no {key}")
+        raise ClipError("missing half", file, f"has no {key}")
     return guarded(str(file), lambda: numbers(arrays, key))
 
 
@@ -57,7 +61,7 @@ def _frames(name: str, space: str, *tracks: tuple[Path, str, NDArray[Any]]) -> i
     """Return the frames of tracks, each with its file and key. Raises ClipError for another width."""
     for file, key, rows in tracks:
         if rows.ndim < 2 or rows.shape[-1] != WIDTHS[space]:
-            raise ClipError.of("wrong dims", file, f"{key} has shape {rows.shape}, expected (T, {WIDTHS[space]})")
+            raise ClipError("wrong dims", file, f"{key} has shape {rows.shape}, expected (T, {WIDTHS[space]})")
     return frames_of(name, *(rows.shape for _, _, rows in tracks))
 
 
@@ -80,7 +84,7 @@ def _listed(place: Path) -> dict[str, str]:
     return {Path(row[1]).stem: row[-1].strip() for row in rows}
 
 
-def dim_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def dim_scan(place: Path, split: str) -> Iterator[Found]:
     listed = _listed(place)
     if _list_file(place) is None:
         yield f"{place}: no {LIST} there or above: all clips count as train"
@@ -93,17 +97,16 @@ def dim_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
         frames = _frames(name, "deca56", *((file, key, _rows(file, unpickle, key)) for key in keys))
 
         def read() -> Dyad:
-            pair = [(f"{file} {key}", pose_last(_rows(file, unpickle, key), pose_first)) for key in keys]
+            pair = [(f"{file} {key}", _rows(file, unpickle, key)) for key in keys]
             return dyad_of(name, pair, frames, "deca56", FPS)
 
-        return Clip(name=name, frames=frames, read=read, features={"hubert": partial(_hubert, file, frames)})
+        def hubert() -> Floats:
+            rows = numbers(unpickle(file), "audio")
+            return track(f"{file} audio", rows, frames, rows.shape[-1])
+
+        return Clip(name=name, frames=frames, read=read, features={"hubert": hubert})
 
     yield from attempt([name for name, theirs in listed.items() if theirs == split], clip)
-
-
-def _hubert(file: Path, frames: int) -> Floats:
-    rows = numbers(unpickle(file), "audio")
-    return track(f"{file} audio", rows, frames, rows.shape[-1])
 
 
 DIM: Final = Layout(
@@ -130,26 +133,22 @@ def _uuids(place: Path) -> dict[str, str]:
     return {row["uuid"]: row.get("data_split") or row.get("split") or "train" for row in rows if row.get("uuid")}
 
 
-def vico_scan(place: Path, split: str, pose_first: bool) -> Iterator[Found]:
+def vico_scan(place: Path, split: str) -> Iterator[Found]:
     def faces(name: str) -> list[tuple[Path, NDArray[Any]]]:
         files = [place / "features" / "video_feats" / f"{name}.{role}.bin" for role in ROLES]
         return [(file, _rows(file, torch_load, _VECTORS)) for file in files]
 
     def clip(name: str) -> Clip:
         frames = _frames(name, "deep3d73", *((file, _VECTORS, rows) for file, rows in faces(name)))
-        features = {"mfcc45": partial(_mfcc45, place / "features" / "audio_feats" / f"{name}.npy", frames)}
+        sound = place / "features" / "audio_feats" / f"{name}.npy"
         return Clip(
             name=name,
             frames=frames,
             read=lambda: dyad_of(name, faces(name), frames, "deep3d73", FPS),
-            features=features,
+            features={"mfcc45": lambda: track(str(sound), npy(existing(sound, "missing feature")), frames, 45)},
         )
 
     yield from attempt([name for name, theirs in _uuids(place).items() if theirs == split], clip)
-
-
-def _mfcc45(file: Path, frames: int) -> Floats:
-    return track(str(file), npy(existing(file, "missing feature")), frames, 45)
 
 
 VICO: Final = Layout(

@@ -19,9 +19,9 @@ from sfms_robot import config
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, LATERAL_POSE, Floats
+from sfms_robot.lab.corpora.clips import UNKNOWN
 from sfms_robot.lab.corpora.clips import Dyad as Conversation
 from sfms_robot.lab.corpora.collection import Dataset
-from sfms_robot.lab.corpora.conversational_states import UNKNOWN
 from sfms_robot.lab.corpora.formats import open_dataset
 from sfms_robot.lab.learning import corpus as dyads
 from sfms_robot.lab.learning.corpus import (
@@ -38,7 +38,6 @@ from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
 from sfms_robot.listeners.arig.modules import StateUnderstanding
 from sfms_robot.listeners.arig.sampler import Denoiser
 from sfms_robot.listeners.arig.stream import FEEDBACK, LISTENING, NODDING, QUANTILES, with_feedback
-from sfms_robot.listeners.idle import LATERAL, among_head
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals import mel, phase
 from sfms_robot.signals.events import runs
@@ -241,7 +240,7 @@ def fit_scales(model: ArigModel, corpus: ArigCorpus) -> None:
     if model.settings.sway:  # of listening where there is any: speakers sway further, and no input tells them apart
         slow = corpus.by_dyad(frames.sway)
         listening = [one for one, scene in zip(slow, corpus.scenes, strict=True) if scene == "listening"]
-        fit_sway(model, listening or slow, among_head(channels, LATERAL))
+        fit_sway(model, listening or slow)
     if isinstance(model.head, Denoiser) and model.settings.diffusion.clamp:
         model.head.low.copy_(drawn.amin(0))
         model.head.high.copy_(drawn.amax(0))
