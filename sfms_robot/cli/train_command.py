@@ -96,7 +96,7 @@ def _train(work: Callable[[TrainOptions], dict[str, Any]], flags: PhaseFlags, ch
     """Run a phase of training, or one step of every phase, and print its figures."""
     if flags.dry_run:
         from sfms_robot.config import load_training
-        from sfms_robot.lab.learning.dry_run import dry_run
+        from sfms_robot.lab.learning.train_runs import dry_run
 
         note = "hours of all stages, computed; {assumed}"
         show(dry_run(load_training(flags.config)), flags.json, keys=("rows", "hours"), note=note)

@@ -2,7 +2,7 @@
 
 The model is what lies between the first call of one of its modules and the end of the backward pass. The rest draws
 windows and noise, cuts and changes them, clips and updates. Steps are those of the shipped files, on made-up frames
-(`learning.dry_run`).
+(`learning.train_runs`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 from sfms_robot.config import load_training
 from sfms_robot.data import data_dir
 from sfms_robot.lab.bench.measure import BenchResult, Row, Say, row
-from sfms_robot.lab.learning.dry_run import jobs_of
 from sfms_robot.lab.learning.job import Job, ProcessGroup
+from sfms_robot.lab.learning.train_runs import jobs_of
 from sfms_robot.lab.learning.training_loop import Gradients, make_step
 from sfms_robot.listeners.registry import one_thread
 

@@ -31,7 +31,7 @@ from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.learning.job import Scratch
 from sfms_robot.lab.learning.training_loop import write_whole
-from sfms_robot.listeners.idle import BANDS, BANDS_HZ, head_channels
+from sfms_robot.listeners.idle import BANDS, BANDS_HZ, LATERAL, among_head, head_channels
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.control import COLUMNS, control_track
 
@@ -231,7 +231,10 @@ def shared_frames(
     face, motion = in_space(dyad, dyad.speaker, space), in_space(dyad, dyad.listener, space)
     known = face.isfinite().all(-1)
     if settings is not None and settings.sway:
-        motion, sway = without_sway(motion, space, settings.channels, dyad.events or ())
+        head = head_channels(settings.channels)
+        slow = torch.from_numpy(slow_part(motion[:, head].numpy(), dyad.events or ()))
+        sway, motion = slow - torch.tensor(space.neutral, dtype=torch.float32)[head], motion.clone()
+        motion[:, head] -= sway
     return torch.where(known[:, None], face, 0.0), known, motion, sway, control
 
 
@@ -330,22 +333,21 @@ PACK_VERSION: Final = 1
 _MADE_FOR: Final = ("kind", "motion_space", "neutral", "metres_per_unit", "sound", "audio", "phase", "events", "sway")
 
 
-def _made_for(listener: config.Sfms | config.Arig, window: int) -> dict[str, Any]:
+def _made_for(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
     """Return the settings that frames depend on, as plain data."""
-    known = listener.model_dump(mode="json")
-    return {**{name: known.get(name) for name in _MADE_FOR}, "window": window}
+    windows = settings.training if isinstance(settings, config.ArigTraining) else settings.listener
+    known = settings.listener.model_dump(mode="json")
+    return {**{name: known.get(name) for name in _MADE_FOR}, "window": windows.window_frames}
 
 
-def write_pack(
-    file: Path, corpora: Mapping[str, Corpus[Any]], listener: config.Sfms | config.Arig, window: int
-) -> None:
+def write_pack(file: Path, corpora: Mapping[str, Corpus[Any]], settings: config.Training | config.ArigTraining) -> None:
     """Write corpora by split to a file, in one move. Raises ConfigError."""
     tensors = {
         f"{split}.{name}": tensor.contiguous()
         for split, corpus in corpora.items()
         for name, tensor in vars(corpus.frames).items()
     }
-    about = {"version": PACK_VERSION, "made for": _made_for(listener, window)}
+    about = {"version": PACK_VERSION, "made for": _made_for(settings)}
     about |= {split: [corpus.lengths, corpus.scenes] for split, corpus in corpora.items()}
     write_whole(file, tensors, {"pack": json.dumps(about)})
 
@@ -353,8 +355,7 @@ def write_pack(
 def training_data(
     data: Path,
     frames: type[Frames],
-    listener: config.Sfms | config.Arig,
-    window: int,
+    settings: config.Training | config.ArigTraining,
     read: Callable[[str], Corpus[Frames]],
 ) -> dict[str, Corpus[Frames]]:
     """Return the frames of train and validation: of the pack `data`, or as `read` returns a split of a folder.
@@ -370,7 +371,7 @@ def training_data(
             about = json.loads((opened.metadata() or {})["pack"])
             if about["version"] != PACK_VERSION:
                 raise ConfigError(f"{data}: version: expected {PACK_VERSION}, got {about['version']}; {again}")
-            for key, ours in _made_for(listener, window).items():
+            for key, ours in _made_for(settings).items():
                 if (theirs := about["made for"].get(key)) != ours:
                     raise ConfigError(f"{data}: {key}: expected {ours!r}, got {theirs!r}; {again}")
             found = {}
@@ -422,21 +423,9 @@ def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
     return slow.astype(np.float32)
 
 
-def without_sway(
-    motion: Tensor, space: MotionSpace, channels: Sequence[str], events: Sequence[ListenerEvent]
-) -> tuple[Tensor, Tensor]:
-    """Return motion (N, C) of a space less the sway of its head, and that sway (N, S) relative to neutral."""
-    head = head_channels(channels)
-    slow = torch.from_numpy(slow_part(motion[:, head].numpy(), events))
-    sway = slow - torch.tensor(space.neutral, dtype=torch.float32)[head]
-    fast = motion.clone()
-    fast[:, head] -= sway
-    return fast, sway
-
-
-def fit_sway(model: SfmsModel | ArigModel, slow: Sequence[Tensor], lateral: Sequence[int]) -> None:
+def fit_sway(model: SfmsModel | ArigModel, slow: Sequence[Tensor]) -> None:
     """Set a model's sway by `sway_of` slow motion (N, S) of people."""
-    mixture, spread = sway_of(slow, lateral)
+    mixture, spread = sway_of(slow, among_head(model.settings.channels, LATERAL))
     model.sway_mixture.copy_(mixture)
     model.sway_spread.copy_(spread)
 

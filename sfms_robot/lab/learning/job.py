@@ -42,7 +42,7 @@ from typing import Any, Final, Literal
 import torch
 import torch.distributed as dist
 from rich.progress import MofNCompleteColumn, TaskID, TextColumn
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 from torch.distributed.rendezvous import rendezvous
 
 from sfms_robot import config
@@ -148,7 +148,7 @@ def _device() -> torch.device:
 # A piece is the same in every process, so the losses of a run do not depend on the number of processes, up to the order
 # of summation. One process with one piece computes what plain training does.
 
-LossOf = Callable[[int, torch.Generator, int], Tensor]
+LossOf = Callable[[int, Generator, int], Tensor]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,14 +177,14 @@ class Job:
         return next(self.model.parameters()).device
 
 
-class OwnNoise(torch.Generator):
+class OwnNoise(Generator):
     """The generator of a GPU's own noise. Nothing of weight 0 is drawn from it.
 
     From the run's generator, on a CPU, everything is drawn in one order whatever its weight: a run repeats bit for bit.
     """
 
 
-def noise_of(generator: torch.Generator, device: torch.device) -> torch.Generator:
+def noise_of(generator: Generator, device: torch.device) -> Generator:
     """Return what draws the noise of a step on `device`: a CPU's is the run's generator, a GPU's is seeded by it."""
     if device.type == "cpu":
         return generator
@@ -193,17 +193,17 @@ def noise_of(generator: torch.Generator, device: torch.device) -> torch.Generato
     return own
 
 
-def uniform(generator: torch.Generator, *shape: int) -> Tensor:
+def uniform(generator: Generator, *shape: int) -> Tensor:
     """Draw numbers of 0..1, on the generator's device."""
     return torch.rand(shape, generator=generator, device=generator.device)
 
 
-def normal(generator: torch.Generator, *shape: int) -> Tensor:
+def normal(generator: Generator, *shape: int) -> Tensor:
     """Draw numbers of mean 0 and deviation 1, on the generator's device."""
     return torch.randn(shape, generator=generator, device=generator.device)
 
 
-def is_drawn(generator: torch.Generator, *weights: float) -> bool:
+def is_drawn(generator: Generator, *weights: float) -> bool:
     """Return whether noise of these weights is drawn from a generator."""
     return any(weights) or not isinstance(generator, OwnNoise)
 
@@ -260,7 +260,7 @@ class Run:
 
     resume: bool = False
     device: torch.device = torch.device("cpu")
-    watches: Sequence[Callable[[Report], None]] = ()
+    watches: Sequence[Watch] = ()
     group: ProcessGroup = ProcessGroup()
     accumulate: int | None = None
     scratch: Path | None = None

@@ -1,4 +1,7 @@
-"""Behind `train`: a configuration and a data folder in, weights and figures out, watched while it runs."""
+"""Behind `train`: a configuration and a data folder in, weights and figures out, watched while it runs.
+
+`train ... --dry-run`: one step of every stage of a training file, on made-up frames, and what all of it would take.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -19,22 +22,47 @@ from torch import Tensor
 from sfms_robot import config
 from sfms_robot.app.progress import Progress, bar, no_progress
 from sfms_robot.config import load_training, parse_training
+from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, SMILE_CORNERS, Doubles
-from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.frames import (
+    CHANNEL_INDEX,
+    EVENT_KINDS,
+    FRAME_HZ,
+    FRAME_S,
+    MOTION_DIM,
+    SMILE_CORNERS,
+    Doubles,
+    ListenerEvent,
+)
+from sfms_robot.lab.bench.measure import memory_mb
+from sfms_robot.lab.bench.operation_count import OperationCount
+from sfms_robot.lab.corpora.clips import Dyad, samples_of
 from sfms_robot.lab.corpora.collection import Dataset, Order, usable
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation.rollout import offline_rollout
+from sfms_robot.lab.learning.arig import features as arig_features
+from sfms_robot.lab.learning.arig.trainer import Student, arig_job, train_arig
 from sfms_robot.lab.learning.arig.trainer import corpora as arig_corpora
-from sfms_robot.lab.learning.arig.trainer import train_arig
-from sfms_robot.lab.learning.corpus import Corpus, without_gaze, write_pack
-from sfms_robot.lab.learning.job import ALONE, Run, Watch, joined, local_rank, progress_bar, tensorboard
+from sfms_robot.lab.learning.corpus import Corpus, fit_sound, without_gaze, write_pack
+from sfms_robot.lab.learning.job import (
+    ALONE,
+    Job,
+    ProcessGroup,
+    Run,
+    Watch,
+    joined,
+    local_rank,
+    progress_bar,
+    tensorboard,
+)
 from sfms_robot.lab.learning.sfms import predictor_trainer as listener
 from sfms_robot.lab.learning.sfms import tokenizer_trainer as tokenizer
-from sfms_robot.lab.learning.sfms.features import corpora, gather, tokenise
+from sfms_robot.lab.learning.sfms.features import corpora, fit_scales, gather, tokenise
 from sfms_robot.lab.learning.sfms.predictor_trainer import corrected
-from sfms_robot.lab.learning.training_loop import checkpoint_file
+from sfms_robot.lab.learning.training_loop import Gradients, checkpoint_file
 from sfms_robot.listeners import checkpoint
+from sfms_robot.listeners.arig.model import ArigModel
+from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
@@ -76,65 +104,48 @@ def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
     settings, began_s = train_settings(options, "tokenizer"), time.monotonic()
     if isinstance(settings, config.ArigTraining):
         raise ConfigError(f"{options.file}: listener.kind = 'arig' has no tokenizer; `train listener` is all of it")
-    with run_of(options) as run:
-        run = _begun(run, options, tokenizer.WEIGHTS, "tokenizer", checkpoint.WEIGHTS, checkpoint.CONFIG)
+    with run_of(options, "tokenizer", tokenizer.WEIGHTS, checkpoint.WEIGHTS, checkpoint.CONFIG) as run:
         figures = tokenizer.train_tokenizer(settings, options.data, options.out, run, options.order)
-    return {**figures, "minutes": _minutes(began_s)} if run.group.first else {}
+    return _told(figures, run, began_s)
 
 
 def train_listener(options: TrainOptions) -> dict[str, Any]:
     """Train SFMS: phase 2, on the tokenizer in `options.out`; or all of ARIG. Returns its figures and minutes."""
     settings, began_s = train_settings(options, "predictor"), time.monotonic()
-    if isinstance(settings, config.Training) and options.data.is_file() and settings.predictor.calibration_rounds:
+    if isinstance(settings, config.ArigTraining):
+        if options.order is not None:
+            where = "an arig listener is trained on files in their layout's own order"
+            raise ConfigError(f"--order {options.order}: {where}")
+        with run_of(options, "arig", checkpoint.WEIGHTS) as run:
+            figures = train_arig(settings, options.data, options.out, run)
+        return _told(figures, run, began_s)
+    packed = options.data.is_file()
+    if packed and settings.predictor.calibration_rounds:
         told = "a pack holds no dyads for the roll-outs of predictor.calibration_rounds"
         raise ConfigError(f"{options.data}: {told}: expected 0 of them, or the folder as --data")
-    arig = isinstance(settings, config.ArigTraining)
-    if arig and options.order is not None:
-        raise ConfigError(f"--order {options.order}: an arig listener is trained on files in their layout's own order")
-    with run_of(options) as run:
-        run = _begun(run, options, checkpoint.WEIGHTS, "arig" if arig else "listener")
-        if isinstance(settings, config.ArigTraining):
-            figures = train_arig(settings, options.data, options.out, run)
-        else:
-            figures = listener.train_listener(settings, options.data, options.out, run, options.order)
-    if not run.group.first:
-        return {}
-    if isinstance(settings, config.Training) and not options.data.is_file():
+    with run_of(options, "listener", checkpoint.WEIGHTS) as run:
+        figures = listener.train_listener(settings, options.data, options.out, run, options.order)
+    if run.group.first and not packed:
         calibrate(settings, options.data, options.out, options.order)
-    return {**figures, "minutes": _minutes(began_s)}
+    return _told(figures, run, began_s)
+
+
+def _told(figures: dict[str, Any], run: Run, began_s: float) -> dict[str, Any]:
+    """Return the figures and the minutes they took, of the first process alone."""
+    return {**figures, "minutes": round((time.monotonic() - began_s) / 60, 2)} if run.group.first else {}
 
 
 def pack_data(file: Path, data: Path, out: Path, order: Order | None = None) -> dict[str, Any]:
     """Write all that the training of a file reads of its data to `out`. Returns dyads, frames and bytes."""
     settings = load_training(file)
-    if isinstance(settings, config.ArigTraining):
-        window = settings.training.window_frames
-        found: Mapping[str, Corpus[Any]] = arig_corpora(settings, data, ALONE)
-    else:
-        window, found = settings.listener.window_frames, corpora(settings, data, ALONE, order)
-    write_pack(out, found, settings.listener, window)
+    found: Mapping[str, Corpus[Any]] = (
+        arig_corpora(settings, data, ALONE)
+        if isinstance(settings, config.ArigTraining)
+        else corpora(settings, data, ALONE, order)
+    )
+    write_pack(out, found, settings)
     counts = {split: {"dyads": len(one.lengths), "frames": sum(one.lengths)} for split, one in found.items()}
     return {"out": str(out), **counts, "bytes": out.stat().st_size}
-
-
-def _minutes(began_s: float) -> float:
-    return round((time.monotonic() - began_s) / 60, 2)
-
-
-def _begun(run: Run, options: TrainOptions, weights: str, job: str, *others: str) -> Run:
-    """Return the run, from its checkpoint where it was started again. Raises ConfigError where files of an earlier
-    training of this job or of `others` would be replaced.
-    """
-    if run.group.restarts:
-        return replace(run, resume=checkpoint_file(options.out, job).exists())
-    if options.resume or options.overwrite:
-        return run
-    run.group.wait()  # nobody has written anything yet
-    for file in (options.out / weights, checkpoint_file(options.out, job), *(options.out / name for name in others)):
-        if file.exists():
-            raise ConfigError(f"{file} is of an earlier training: --resume continues it, --overwrite starts again")
-    run.group.wait()
-    return run
 
 
 def device_of(name: str) -> torch.device:
@@ -162,9 +173,13 @@ def train_settings(options: TrainOptions, phase: str = "training") -> config.Tra
 
 
 @contextmanager
-def run_of(options: TrainOptions) -> Iterator[Run]:
-    """Yield the run with the settings of the command line, and a progress bar."""
-    device = device_of(options.device)
+def run_of(options: TrainOptions, job: str, *made: str) -> Iterator[Run]:
+    """Yield the run of a job with the settings of the command line, and a progress bar.
+
+    What torchrun has started again resumes from its checkpoint. Raises ConfigError where this run would replace its
+    checkpoint, or the files `made` by an earlier training.
+    """
+    device, kept = device_of(options.device), checkpoint_file(options.out, job)
     with ExitStack() as stack:
         if device.type == "cuda":
             device = torch.device("cuda", local_rank())
@@ -175,8 +190,16 @@ def run_of(options: TrainOptions) -> Iterator[Run]:
             if installed if options.tensorboard is None else options.tensorboard:
                 watches.append(stack.enter_context(tensorboard(options.out / "tensorboard")))
             watches.append(stack.enter_context(progress_bar()))
+        if not (group.restarts or options.resume or options.overwrite):
+            group.wait()  # nothing has been written yet by any of them
+            for file in (*(options.out / name for name in made), kept):
+                if file.exists():
+                    raise ConfigError(
+                        f"{file} is of an earlier training: --resume continues it, --overwrite starts again"
+                    )
+            group.wait()
         yield Run(
-            resume=options.resume,
+            resume=kept.exists() if group.restarts else options.resume,
             device=device,
             watches=tuple(watches),
             group=group,
@@ -295,3 +318,163 @@ def _smiles(dyad: Dyad) -> Iterator[tuple[Doubles, Doubles]]:
 def _rates(tokens: Tensor) -> list[float]:
     """Return keyframes per frame of each group, in tokens (N, G)."""
     return [float(rate) for rate in (tokens > 0).float().mean(0)]
+
+
+# --- Behind `--dry-run` ---------------------------------------------------------------------------------------------
+#
+# Operations, bytes and calls are counted, not guessed: of a piece of the batch that is small enough for this machine,
+# forward and backward, as often as the batch has such pieces, and of the update of all weights. A GPU's time for a step
+# is then the longest of three: operations at a share of its peak, bytes at a share of its bandwidth, calls at what one
+# costs the processor that makes them. Random numbers are drawn on the GPU (`learning.job`): bytes and calls like
+# others. The shares are assumptions, told with the figures.
+
+MOST_FRAMES: Final = 1200  # of a piece: what a small machine holds
+REACHED: Final = 0.3  # of a GPU's peak, and `STREAMED` of its bandwidth
+STREAMED: Final = 0.7
+CALL_US: Final = 8.0  # one call of torch from Python
+CPU: Final = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class Gpu:
+    """Peaks as its maker states them: dense bf16 and fp32 (TF32) operations [1/s], memory [byte/s]."""
+
+    bf16: float
+    fp32: float
+    memory: float
+
+
+GPUS: Final = {
+    "A100": Gpu(312e12, 156e12, 2.0e12),
+    "H100": Gpu(989e12, 494e12, 3.35e12),
+    "RTX 4090": Gpu(165e12, 82e12, 1.0e12),
+}
+ASSUMED: Final = (
+    f"assumed of a GPU: {REACHED:.0%} of its peak, {STREAMED:.0%} of its bandwidth, {CALL_US:g} us a call of torch "
+    "(nothing compiled); looks at held-out data are not counted"
+)
+
+
+def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
+    """Return figures of every stage, and hours of all their steps.
+
+    Blocks: up to minutes at the paper's sizes on a small machine, most of it backward passes.
+    """
+    stages = [_measured(job) for job in jobs_of(settings)]
+    hours = {gpu: round(sum(stage["hours"][gpu] for stage in stages), 2) for gpu in GPUS}
+    return {"stages": stages, "hours": hours, "assumed": ASSUMED, "rows": [_row(stage) for stage in stages]}
+
+
+def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[Job]:
+    """Yield the job of each stage, on initial weights and made-up frames."""
+    torch.manual_seed(settings.seed)
+    listener = settings.listener
+    space = MotionSpace.of(listener)
+    if isinstance(settings, config.ArigTraining):
+        phase = settings.training
+        student = Student(ArigModel(settings.listener))
+        dyads = _made_up(phase.window_frames + FRAME_HZ, listener)
+        corpus = arig_features.gather(
+            dict.fromkeys(arig_features.SCENES, dyads), phase.window_frames, space, settings.listener
+        )
+        arig_features.fit_scales(student.model, corpus)
+        yield arig_job(settings, student, corpus, corpus, CPU)
+        return
+    window = settings.listener.window_frames
+    dyads = _made_up(2 * window, listener)
+    plain = gather(dyads, window, space, None, settings.listener)
+    model = SfmsModel(settings.listener)
+    fit_scales(model, plain)
+    yield tokenizer.tokenizer_job(settings, model, plain, plain, CPU)
+    heard = gather(dyads, window, space, AudioFrontend.of(settings.listener), settings.listener)
+    fit_sound(model.cpu(), (heard.frames.sound, heard.frames.heard))
+    yield listener.listener_job(settings, model, heard, heard, CPU)
+
+
+def _made_up(frames: int, listener: config.Sfms | config.Arig) -> list[Dyad]:
+    """Make conversations of noise, in the listener's space, or where it has events in arkit58.
+
+    The cost of a step does not depend on the content.
+    """
+    rng, space = np.random.default_rng(0), MotionSpace.of(listener)
+    name, rest = ("arkit58", np.full(MOTION_DIM, 0.1)) if listener.events else (space.name, space.neutral)
+    found = []
+    for index in range(2):
+        motion, face = (rng.normal(rest, 0.05, (frames, len(rest))).astype(np.float32) for _ in range(2))
+        voice, own = (rng.normal(0, 0.05, samples_of(frames, FRAME_HZ)).astype(np.float32) for _ in range(2))
+        sizes = {"wav2vec2": 768, "agent_wav2vec2": 768, "mfcc78": 78}
+        found.append(
+            Dyad(
+                name=f"made up {index}",
+                audio=voice,
+                speaker=face,
+                listener=motion,
+                listening=np.ones(frames, bool),
+                space=name,
+                agent_audio=own,
+                features={key: rng.normal(size=(frames, size)).astype(np.float32) for key, size in sizes.items()},
+                states=rng.integers(0, len(STATES), frames).astype(np.int8),
+                events=tuple(ListenerEvent(kind, 0.4 + 0.1 * k, 0.4, 0.1, 1) for k, kind in enumerate(EVENT_KINDS)),
+                head_of_gaze_rad=np.zeros((frames, 3), np.float32),
+            )
+        )
+    return found
+
+
+def _measured(job: Job) -> dict[str, Any]:
+    """Measure one piece of a batch and the update after it; all pieces of a batch are alike."""
+    batch, window = job.phase.batch, job.frames_per_step // job.phase.batch
+    samples = max((n for n in range(1, batch + 1) if batch % n == 0 and n * window <= MOST_FRAMES), default=1)
+    pieces = batch // samples
+    piece = replace(job, phase=job.phase.model_copy(update={"batch": samples}))
+    job.model.train()
+    began_s = time.perf_counter()
+    gradients = Gradients(piece, ProcessGroup(), 1, Path())
+    with OperationCount() as count:
+        loss = gradients.of(0, torch.Generator().manual_seed(job.seed))
+    with OperationCount() as update:
+        for one in job.optimizers:
+            one.step()
+    half = job.phase.precision == "bf16"
+    figures = {
+        "operations": pieces * count.operations + update.operations,
+        "bytes": pieces * count.bytes + update.bytes,
+        "calls": count.calls + update.calls,  # on a GPU the batch is one piece
+        "drawn": pieces * count.drawn,
+    }
+    steps_s = {
+        name: max(
+            figures["operations"] / (REACHED * (gpu.bf16 if half else gpu.fp32)),
+            figures["bytes"] / (STREAMED * gpu.memory),
+            figures["calls"] * CALL_US * 1e-6,
+        )
+        for name, gpu in GPUS.items()
+    }
+    return {
+        "stage": job.name,
+        "steps": job.phase.steps,
+        "batch": batch,
+        "window_frames": window,
+        "pieces": pieces,
+        "params": sum(each.numel() for each in job.model.parameters()),
+        "precision": job.phase.precision,
+        "loss": float(loss),
+        **figures,
+        "here_s": round(time.perf_counter() - began_s, 2),
+        "here_peak_mb": round(memory_mb("VmHWM"), 1),
+        "hours": {name: round(job.phase.steps * step_s / 3600, 3) for name, step_s in steps_s.items()},
+    }
+
+
+def _row(stage: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "stage": stage["stage"],
+        "million weights": round(stage["params"] / 1e6, 1),
+        "steps": stage["steps"],
+        "frames a step": stage["batch"] * stage["window_frames"],
+        "GFLOP a step": round(stage["operations"] / 1e9, 1),
+        "GB a step": round(stage["bytes"] / 1e9, 2),
+        "calls": stage["calls"],
+        "here s": stage["here_s"],
+        **{f"{gpu} h": hours for gpu, hours in stage["hours"].items()},
+    }

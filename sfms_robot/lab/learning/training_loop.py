@@ -24,7 +24,7 @@ from types import FrameType
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from sfms_robot import config
@@ -60,16 +60,18 @@ def fit(job: Job, out: Path, run: Run = ALONE, clock: Callable[[], float] = time
     file, phase = checkpoint_file(out, job.name), job.phase
     group, pieces = run.group, pieces_of(job, run, file)
     job = replace(job, identity={**job.identity, **({"pieces": pieces} if pieces > 1 else {})})
-    _make_folder(out)  # hours before it is needed
-    generator = torch.Generator().manual_seed(job.seed)
+    try:
+        out.mkdir(parents=True, exist_ok=True)  # hours before it is needed
+    except OSError as error:
+        raise ConfigError(f"{out}: cannot be made a folder: {error}") from error
+    generator = Generator().manual_seed(job.seed)
     torch.manual_seed(job.seed)  # dropout does not depend on what was drawn before
-    base = [[group["lr"] for group in one.param_groups] for one in job.optimizers]
     position, best = Position(), None
     if run.resume:
         position, best = load_checkpoint(file, job, generator)
     elif group.first and (left := peek(file)) and not left[0].finished:
         log.warning("%s: was at step %d, starts again; --resume would have continued", file, left[0].step)
-    began_at = position.step
+    began_at, rates = position.step, job.optimizers[0].param_groups[0]
     saved_s = began_s = clock()
     job.model.train()
     gradients = Gradients(job, group, pieces, file, run.read_every)
@@ -78,7 +80,7 @@ def fit(job: Job, out: Path, run: Run = ALONE, clock: Callable[[], float] = time
     with _interruptions(patient=group.size > 1) as pressed:
         while not position.finished:
             step = position.step + len(made)
-            _set_rates(job, base, step)
+            _set_rates(job, step)
             with _enough_memory(gradients, position, made, generator, best):
                 made.append(make_step(gradients, step, generator))
             looked = every > 0 and ((step + 1) % every == 0 or step + 1 == phase.steps)
@@ -97,7 +99,7 @@ def fit(job: Job, out: Path, run: Run = ALONE, clock: Callable[[], float] = time
                 now_s = clock()
                 report = Report(
                     name=job.name, steps=phase.steps, position=position, loss=loss, gradient_norm=norm,
-                    learning_rate=base[0][0] * schedule(position.step - 1, phase), looked=looks,
+                    learning_rate=rates["initial_lr"] * schedule(position.step - 1, phase), looked=looks,
                     frames_per_s=job.frames_per_step * (position.step - began_at) / max(now_s - began_s, 1e-9),
                 )  # fmt: skip
                 for watch in run.watches:
@@ -128,13 +130,6 @@ def _ended(job: Job, position: Position, best: Weights | None, resumed_at: int |
     )
 
 
-def _make_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{out}: cannot be made a folder: {error}") from error
-
-
 def schedule(step: int, phase: config.Phase) -> float:
     """Return the share of the learning rate at `step`: linear warm-up, cosine to zero (V-A; the warm-up is ours)."""
     warm = min(phase.warm_up_steps, max(1, phase.steps // 10))
@@ -143,15 +138,15 @@ def schedule(step: int, phase: config.Phase) -> float:
     return 0.5 * (1 + math.cos(math.pi * (step - warm) / max(1, phase.steps - warm)))
 
 
-def _set_rates(job: Job, base: Sequence[Sequence[float]], step: int) -> None:
-    """Set the rates of `step` from those of the new optimizers."""
+def _set_rates(job: Job, step: int) -> None:
+    """Set the rates of `step` from those of the new optimizers, which stay as `initial_lr`."""
     share = schedule(step, job.phase)
-    for one, rates in zip(job.optimizers, base, strict=True):
-        for group, rate in zip(one.param_groups, rates, strict=True):
-            group["lr"] = rate * share
+    for one in job.optimizers:
+        for group in one.param_groups:
+            group["lr"] = group.setdefault("initial_lr", group["lr"]) * share
 
 
-def make_step(gradients: Gradients, step: int, generator: torch.Generator) -> Tensor:
+def make_step(gradients: Gradients, step: int, generator: Generator) -> Tensor:
     """Update the weights once; return loss and largest gradient norm (2,) of this process, on the device.
 
     Raises ModelError when loss or norm of a CPU is not finite, and nothing is updated then; GroupError.
@@ -181,7 +176,7 @@ def _enough_memory(
     gradients: Gradients,
     position: Position,
     made: Sequence[Tensor],
-    generator: torch.Generator,
+    generator: Generator,
     best: Weights | None,
 ) -> Iterator[None]:
     """Run a step; where the GPU has too little memory, write a checkpoint of those `made`, and raise ModelError."""
@@ -293,7 +288,7 @@ class Gradients:
                 loss = DistributedDataParallel(loss, find_unused_parameters=True)
         self._loss = loss
 
-    def of(self, step: int, generator: torch.Generator) -> Tensor:
+    def of(self, step: int, generator: Generator) -> Tensor:
         """Return the loss of this process' pieces; set the gradients of all processes. Raises GroupError."""
         if self._pieces == 1:
             return self._piece(step, generator, 1)
@@ -304,7 +299,7 @@ class Gradients:
             torch.manual_seed(seed)  # of dropout
             quiet = isinstance(self._loss, DistributedDataParallel) and piece != mine[-1]
             with self._loss.no_sync() if quiet else nullcontext():  # type: ignore[operator]
-                total += self._piece(step, torch.Generator().manual_seed(seed), len(mine))
+                total += self._piece(step, Generator().manual_seed(seed), len(mine))
         return total
 
     @contextmanager
@@ -335,7 +330,7 @@ class Gradients:
             broken = f"loss {made[0]:g}, gradient norm {made[1]:g} at step {step}: not finite"
             raise ModelError(f"{self.job.name}: {broken} ({_kept(self.file)})")
 
-    def _piece(self, step: int, generator: torch.Generator, share: int) -> Tensor:
+    def _piece(self, step: int, generator: Generator, share: int) -> Tensor:
         with torch.autocast(self.job.device.type, torch.bfloat16, enabled=self._half):
             loss: Tensor = self._loss(step, generator, self._samples)
         with self.group.talking():
@@ -350,7 +345,7 @@ class _Loss(nn.Module):
         super().__init__()
         self.model, self._loss_of = model, loss_of
 
-    def forward(self, step: int, generator: torch.Generator, samples: int) -> Tensor:
+    def forward(self, step: int, generator: Generator, samples: int) -> Tensor:
         return self._loss_of(step, generator, samples)
 
 
@@ -387,7 +382,7 @@ def digest_of(module: nn.Module) -> str:
     return digest.hexdigest()
 
 
-def save_checkpoint(file: Path, job: Job, position: Position, generator: torch.Generator, best: Weights | None) -> None:
+def save_checkpoint(file: Path, job: Job, position: Position, generator: Generator, best: Weights | None) -> None:
     """Write a checkpoint (`write_whole`)."""
     tensors = {f"model.{name}": value for name, value in weights_of(job).items()}
     tensors |= {f"best.{name}": value for name, value in (best or {}).items()}
@@ -416,7 +411,7 @@ def write_whole(file: Path, tensors: Weights, metadata: dict[str, str]) -> None:
         raise ConfigError(f"{file}: cannot be written: {error}") from error
 
 
-def load_checkpoint(file: Path, job: Job, generator: torch.Generator) -> tuple[Position, Weights | None]:
+def load_checkpoint(file: Path, job: Job, generator: Generator) -> tuple[Position, Weights | None]:
     """Put model, optimizers and all random states where `file` left them.
 
     Raises:

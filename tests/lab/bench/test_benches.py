@@ -16,7 +16,7 @@ from sfms_robot.lab import bench
 from sfms_robot.lab.bench import BENCHES, Bench, measure_all, run_bench
 from sfms_robot.lab.bench.measure import BenchResult, environment, row, write_page
 from sfms_robot.lab.bench.operation_count import OperationCount
-from sfms_robot.lab.learning import dry_run
+from sfms_robot.lab.learning import train_runs
 
 
 def quiet(line: str) -> None:
@@ -107,10 +107,10 @@ def test_a_layer_and_attention_cost_their_operations_and_gradients_as_many_again
 @pytest.mark.parametrize(("most_frames", "pieces"), [(1200, 1), (48, 2), (1, 4)])
 def test_a_step_costs_the_same_however_small_the_pieces_that_are_made_of_it(monkeypatch, most_frames, pieces):
     """But for what is done once a piece: scaling the loss, sums of gradients."""
-    monkeypatch.setattr(dry_run, "MOST_FRAMES", most_frames)
-    (found,) = dry_run.dry_run(tiny_arig_training.settings())["stages"]
+    monkeypatch.setattr(train_runs, "MOST_FRAMES", most_frames)
+    (found,) = train_runs.dry_run(tiny_arig_training.settings())["stages"]
     monkeypatch.undo()
-    (whole,) = dry_run.dry_run(tiny_arig_training.settings())["stages"]
+    (whole,) = train_runs.dry_run(tiny_arig_training.settings())["stages"]
     assert (found["pieces"], found["batch"], found["steps"]) == (pieces, 4, 6)
     assert found["operations"] == pytest.approx(whole["operations"], rel=0.1)
     assert found["drawn"] == pytest.approx(whole["drawn"], rel=0.1)

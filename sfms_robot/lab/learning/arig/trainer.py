@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
@@ -75,12 +75,12 @@ def train_arig(
 
 def corpora(settings: config.ArigTraining, data: Path, run: Run) -> dict[str, ArigCorpus]:
     """Return the frames of train and validation, from a folder or a pack."""
-    listener, window = settings.listener, settings.training.window_frames
+    window, listener = settings.training.window_frames, settings.listener
 
     def read(split: str) -> ArigCorpus:
         return gather(open_scenes(data, split), window, MotionSpace.of(listener), listener, run.staging(split))
 
-    return training_data(data, LabelledDyad, listener, window, read)
+    return training_data(data, LabelledDyad, settings, read)
 
 
 def arig_job(
@@ -96,7 +96,7 @@ def arig_job(
     student.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
 
-    def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
+    def loss_of(step: int, generator: Generator, batch: int) -> Tensor:
         chosen = draw(starts, weights_of(phase.stage(step), starts), batch, generator, eventful, phase.event_windows)
         dyad = cut(corpus, chosen.to(device, non_blocking=True), phase.window_frames)
         noise = noise_of(generator, device)
@@ -147,7 +147,7 @@ def draw(
     starts: Mapping[str, Tensor],
     weights: Tensor,
     count: int,
-    generator: torch.Generator,
+    generator: Generator,
     eventful: Mapping[str, Sequence[Tensor]] = MappingProxyType({}),
     share: float = 0.0,
 ) -> Tensor:
@@ -169,15 +169,14 @@ def draw(
 def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase) -> LossParts:
     """Return the losses, without augmentation, on windows drawn with a fixed seed as the last stage draws them."""
     student.eval()
-    generator = torch.Generator().manual_seed(0)
+    generator = Generator().manual_seed(0)
     starts = corpus.starts_by_scene(phase.window_frames)
     chosen = draw(starts, weights_of(phase.stages[-1], starts), HELD_OUT_WINDOWS, generator)
     found = []
     for some in torch.split(chosen, HELD_OUT_BATCH):
         dyad = cut(corpus, some.to(student.readout.weight.device), phase.window_frames)
         found.append(loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase, generator))
-    mean = {name: torch.stack([getattr(one, name) for one in found]).mean() for name in ("motion", "state", "coarse")}
-    return LossParts(**mean)
+    return LossParts(*(torch.stack(each).mean() for each in zip(*found, strict=True)))
 
 
 # --- Losses ----------------------------------------------------------------------------------------------------------
@@ -212,8 +211,7 @@ class Student(nn.Module):
         self.readout = nn.Linear(model.settings.width, model.channels)
 
 
-@dataclass(frozen=True)
-class LossParts:
+class LossParts(NamedTuple):
     """Means over frames: equation (3), cross-entropy of labelled frames, squared error of the coarse motion."""
 
     motion: Tensor
@@ -225,7 +223,7 @@ class LossParts:
 
 
 def loss_parts(
-    student: Student, told: ArigDyad, states: Tensor, truth: Tensor, phase: config.ArigPhase, generator: torch.Generator
+    student: Student, told: ArigDyad, states: Tensor, truth: Tensor, phase: config.ArigPhase, generator: Generator
 ) -> LossParts:
     """Return the losses of frames 1..N-1.
 
@@ -241,8 +239,7 @@ def loss_parts(
     weights = None
     if phase.group_weights is not None:
         listener = model.settings
-        weights = channel_weights(listener.channels, listener.drawn_channels, phase.group_weights)
-        weights = sent(weights, truth.device)
+        weights = sent(channel_weights(listener.channels, listener.drawn_channels, phase.group_weights), truth.device)
     before = previous_states(states, phase.state_noise, generator, len(model.settings.states))
     found = model.condition(told, None if phase.own_states else before)
     target = model.standardise(truth[:, 1:])
@@ -282,9 +279,7 @@ def channel_weights(channels: tuple[str, ...], drawn: tuple[str, ...], groups: c
     return weights / weights.sum()
 
 
-def augment(
-    dyad: ArigDyad, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
-) -> tuple[ArigDyad, Tensor]:
+def augment(dyad: ArigDyad, model: ArigModel, phase: config.ArigPhase, generator: Generator) -> tuple[ArigDyad, Tensor]:
     """Return windows with missing modalities, other microphones and a noisy past; and the motion (B, N, C) after it.
 
     The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
@@ -356,7 +351,7 @@ def _silence(frames: int) -> Tensor:
     return torch.from_numpy(track(np.zeros(frames * FRAME_SAMPLES, np.float32))[0])
 
 
-def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator) -> Tensor:
+def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: Generator) -> Tensor:
     """Draw what another microphone would add (B, N, A) to logarithms of power; nothing to other features."""
     place = generator.device
     off = torch.zeros(b, n, model.sound_width, device=place)
@@ -375,7 +370,7 @@ def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, gener
 
 
 def _in_a_room(
-    sound: Tensor, voiced: Tensor, silent: Tensor, model: ArigModel, phase: config.ArigPhase, generator: torch.Generator
+    sound: Tensor, voiced: Tensor, silent: Tensor, model: ArigModel, phase: config.ArigPhase, generator: Generator
 ) -> Tensor:
     """Return sound (B, N, A) of the user with some non-speech (voiced (B, N, 1)) or all of it (silent (B, 1)) removed.
 
@@ -393,9 +388,7 @@ def _in_a_room(
     return torch.where(silent[..., None], sent(_silence(n), sound.device), quieter)
 
 
-def _wander(
-    b: int, n: int, channels: int, phase: config.ArigPhase, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
+def _wander(b: int, n: int, channels: int, phase: config.ArigPhase, generator: Generator) -> tuple[Tensor, Tensor]:
     """Return noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of
     steps.
 
@@ -434,7 +427,7 @@ def _left(frames: int) -> Tensor:
     return ((1 - RETURN) ** (frame[:, None] - frame).double()).tril().float()
 
 
-def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
+def _glided(jumps: Tensor, generator: Generator) -> Tensor:
     """Spread jumps (B, N, C) evenly over the frames from each on: 1 to `GLIDE`, drawn for each window."""
     b, n = jumps.shape[:2]
     frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator, device=jumps.device)
@@ -444,7 +437,7 @@ def _glided(jumps: Tensor, generator: torch.Generator) -> Tensor:
     return (total[:, 1:] - ended) / frames[..., None]
 
 
-def previous_states(states: Tensor, share: float, generator: torch.Generator, count: int) -> Tensor:
+def previous_states(states: Tensor, share: float, generator: Generator, count: int) -> Tensor:
     """Return the states (B, N) for the model: unlabelled ones count as `waiting`, a share is drawn at random of
     `count`.
     """

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, Ints
-from sfms_robot.lab.corpora.compose.ami import MeetingPerson
+from sfms_robot.lab.corpora.compose.ami import MeetingPerson, interval_table
 from sfms_robot.lab.corpora.compose.composed import Stretch, active, spans_by
 from sfms_robot.lab.evaluation.intervals import Sums
 from sfms_robot.lab.evaluation.phrase_timing import (
@@ -36,6 +37,7 @@ from sfms_robot.listeners.events.model import LEAD_FRAMES, LISTENING_S, STEP_FRA
 from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals.phase import piecewise_linear_basis
 
+_Number = TypeVar("_Number", bound=np.generic)
 Knots = tuple[float, ...]
 Groups = Mapping[str, Knots]  # evidence -> knots of its curve; none for a number
 
@@ -91,8 +93,17 @@ GROUPS: Final[Mapping[str, Groups]] = {
     },
     "smile": {**PHASE, **OWN_VOICE, "nod_s": _SHORT, "mm_hm_s": _SHORT, "laugh_s": _LAUGH, **THEIR_SMILE},
     "brow_raise": {**PHASE, **OWN_VOICE, "nod_s": _SHORT},
-    "shake": {"silence_s": _SILENCE, "one_speaks": (), "several_speak": (), **OWN_VOICE, "shake_end_s": _LONG, **GAZE},
-    "tilt": {"silence_s": _SILENCE, "one_speaks": (), "several_speak": (), **OWN_VOICE, "tilt_end_s": _LONG, **GAZE},
+    **{
+        kind: {
+            "silence_s": _SILENCE,
+            "one_speaks": (),
+            "several_speak": (),
+            **OWN_VOICE,
+            f"{kind}_end_s": _LONG,
+            **GAZE,
+        }
+        for kind in ("shake", "tilt")
+    },
     "gaze_shift": {**PHASE, **FLOOR, **OWN_VOICE, "at_person_s": (0.0, 0.4, 0.8, 1.6, 3.2, 6.4, 12.8), "nod_s": _SHORT},
 }
 
@@ -126,31 +137,28 @@ class EventStudent:
 def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
     """Return the training rows of one person; `rng` draws the events that were not annotated."""
     scene, listening = meeting_scene(person)
-    smiles = sizes.others_smiles(len(listening) * FRAME_S, rng.spawn(1)[0])
-    scene = replace(scene, smiles=_seen_smiles(np.concatenate([smiles, _laughing(person)]), len(listening)))
+    smiles, laughs = sizes.others_smiles(len(listening) * FRAME_S, rng.spawn(1)[0]), person.others_laughs
+    # Laughs are seen as `render_events.speaker_motion` lays them.
+    seen = np.stack([laughs[:, 0] - 0.2, laughs[:, 1] + 1.1, np.full(len(laughs), np.mean(sizes.LAUGH))], axis=1)
+    scene = replace(scene, smiles=_seen_smiles(np.concatenate([smiles, seen]), len(listening)))
     spans = spans_of(person, rng, smiles)
     nods = begun_in(spans["nod"], listening)
     heard = heard_in(scene)
     smiled = (heard[:, AT["others_smile_s"]] <= LISTENING_S) & ~scene.speaks[:, MINE]
-    may = {"smile": listening | smiled}
-    lessons = {kind: lesson(each, may.get(kind, listening)) for kind, each in spans.items()}
+    lessons = {kind: lesson(each, listening | smiled if kind == "smile" else listening) for kind, each in spans.items()}
     own, aside = {**spans, "nod": nods}, None
     if person.gaze is not None:
         own["gaze_shift"], aside, lessons["gaze_shift"] = looks_of(person, scene)
     ends_s = np.arange(1.0, len(listening) + 1) * FRAME_S
     rows = np.concatenate([heard, done_at(own, ends_s, log_rate(nods, listening), aside)], axis=1)
-    return EventStudent(person=person, scene=scene, evidence=_by_step(rows), listening=listening, lessons=lessons)
+    return EventStudent(
+        person=person, scene=scene, evidence=by_step(rows, np.nan), listening=listening, lessons=lessons
+    )
 
 
 def _seen(start_s: float) -> int:
     """Return the frame in which a smile from `start_s` on is first seen."""
     return round((start_s + SEEN_S) * FRAME_HZ)
-
-
-def _laughing(person: MeetingPerson) -> Doubles:
-    """Return the smiles (K, 3) of others' laughs, as `render_events.speaker_motion` lays them."""
-    laughs = person.others_laughs
-    return np.stack([laughs[:, 0] - 0.2, laughs[:, 1] + 1.1, np.full(len(laughs), np.mean(sizes.LAUGH))], axis=1)
 
 
 def _seen_smiles(smiles: Doubles, frames: int) -> Doubles:
@@ -165,14 +173,8 @@ def _seen_smiles(smiles: Doubles, frames: int) -> Doubles:
 def muted(one: EventStudent) -> EventStudent:
     """Return the rows without the person's own voice among the evidence."""
     evidence = one.evidence.copy()
-    evidence[:, : len(HEARD)] = _by_step(heard_in(unspoken(one.scene)))
+    evidence[:, : len(HEARD)] = by_step(heard_in(unspoken(one.scene)), np.nan)
     return replace(one, evidence=evidence)
-
-
-def _by_step(rows: Doubles) -> Doubles:
-    """Return what is known of rows (N, E) of frames as each step begins (M, E): before the first, nothing."""
-    before = np.concatenate([np.full((1, rows.shape[1]), np.nan), rows[STEP_FRAMES - 1 :: STEP_FRAMES]])
-    return before[: len(rows) // STEP_FRAMES]
 
 
 def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
@@ -181,12 +183,17 @@ def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
     """
     begun = np.searchsorted(np.sort(nods_s[:, 0]), (np.arange(len(listening)) + 1) * FRAME_S - 1e-6)
     listened = np.cumsum(listening) / FRAME_HZ / 60
-    return np.asarray(np.log((begun + PRIOR_NODS) / (listened + PRIOR_NODS / PRIOR_PER_MINUTE)))
+    return np.log((begun + PRIOR_NODS) / (listened + PRIOR_NODS / PRIOR_PER_MINUTE))
+
+
+def step_at(times_s: Doubles, step_s: float) -> Ints:
+    """Return in which step of this length each time lies; one that is hardly before a step lies in it."""
+    return np.floor(times_s / step_s + 1e-6).astype(np.int64)
 
 
 def begun_in(spans: Doubles, mask: Bools) -> Doubles:
     """Return those of the spans (K, 2) that begin in frames of a mask (N,)."""
-    at = np.floor(spans[:, 0] * FRAME_HZ + 1e-6).astype(np.int64)
+    at = step_at(spans[:, 0], FRAME_S)
     return spans[(at < len(mask)) & mask[np.minimum(at, len(mask) - 1)]]
 
 
@@ -206,10 +213,10 @@ class Lesson:
     may: Bools
 
 
-def steps_of(mask: Bools) -> Bools:
-    """Map frames (N,) to steps (N // 2,), by the last frame before each; nothing holds before the first."""
-    before: Bools = np.r_[False, mask[STEP_FRAMES - 1 :: STEP_FRAMES]]
-    return before[: len(mask) // STEP_FRAMES]
+def by_step(frames: NDArray[_Number], before: float = False) -> NDArray[_Number]:
+    """Map frames (N, ...) to steps (N // 2, ...), by the last frame before each; `before` stands before the first."""
+    known = np.concatenate([np.full_like(frames[:1], before), frames[STEP_FRAMES - 1 :: STEP_FRAMES]])
+    return known[: len(frames) // STEP_FRAMES]
 
 
 def spans_of(person: MeetingPerson, rng: np.random.Generator, others_smiles: Doubles) -> dict[str, Doubles]:
@@ -248,8 +255,8 @@ def _spans(starts_s: Doubles, length_s: float) -> Doubles:
 def lesson(spans_s: Doubles, listening: Bools) -> Lesson:
     """Return the lesson of events (K, 2); none begins inside another."""
     taken = near(spans_s + [0.0, -FRAME_S], len(listening), FRAME_HZ, 0.0)
-    begins = np.floor(spans_s[:, 0] / STEP_S + 1e-6).astype(np.int64)
-    heard = steps_of(listening)
+    begins = step_at(spans_s[:, 0], STEP_S)
+    heard = by_step(listening)
     onsets = np.unique(begins[(begins >= 0) & (begins < len(heard))])
     onsets = onsets[heard[onsets]]
     may = heard & ~taken[: len(heard) * STEP_FRAMES : STEP_FRAMES]  # that one is over is known as it ends
@@ -275,11 +282,11 @@ def looks_of(person: MeetingPerson, scene: Scene) -> tuple[Doubles, Bools, Lesso
     )
     away = [start for (start, _, _), begin, goes in zip(gaze, first, aside, strict=True)
             if goes and begin and at_speaker[begin - 1]]  # fmt: skip
-    may = steps_of(at_speaker)
-    begins = np.floor(np.array(away) * FRAME_HZ / STEP_FRAMES + 1e-6).astype(np.int64)
+    may = by_step(at_speaker)
+    begins = step_at(np.array(away), STEP_S)
     onsets = np.unique(begins[(begins > 0) & (begins < len(may))])
     may[onsets] = True
-    return np.array([look[:2] for look in gaze], np.float64).reshape(-1, 2), aside, Lesson(onsets, may)
+    return interval_table(look[:2] for look in gaze), aside, Lesson(onsets, may)
 
 
 def minutes(mask: Bools) -> float:
@@ -310,7 +317,7 @@ def meeting_scene(person: MeetingPerson) -> tuple[Scene, Bools]:
         if agent in person.gaze_known:
             looks[:, column] = active(spans_by(person.looked_at, agent), whole)
     nods = np.zeros(whole.frames, bool)
-    at = np.floor(spans_by(person.others_nods)[:, 0] * FRAME_HZ + 1e-6).astype(np.int64)
+    at = step_at(spans_by(person.others_nods)[:, 0], FRAME_S)
     nods[at[(at >= 0) & (at < whole.frames)]] = True
     laughs = active(person.others_laughs, whole)
     scene = Scene(np.stack(speaks, axis=1), looks, laughs, nods, np.zeros(whole.frames))
@@ -394,13 +401,6 @@ def ranked(students: Iterable[EventStudent], kind: str, score: Callable[[Doubles
     )
 
 
-def rate_per_minute(students: Iterable[EventStudent], kind: str) -> float:
-    """Return the onsets per minute of the time in which they may happen; 0 without any."""
-    lessons = [one.lessons[kind] for one in students if kind in one.lessons]
-    onsets, time = sum(len(one.onsets) for one in lessons), sum(minutes(one.may) for one in lessons)
-    return float(onsets / time) if time else 0.0
-
-
 # --- Logistic regression with a ridge, by Newton's method: few inputs, many rows, no options ----------------------
 
 NEWTON_STEPS: Final = 8
@@ -461,8 +461,8 @@ def _at(
 
 def count(one: EventStudent, onsets_s: Doubles) -> tuple[Sums, Doubles]:
     """Return the counts of one person's nods: pairs (nods, minutes); and the intervals [s] in listening time."""
-    listening = steps_of(one.listening)[: len(one.evidence)]
-    steps = np.minimum(np.floor(onsets_s / STEP_S + 1e-6).astype(np.int64), len(listening) - 1)
+    listening = by_step(one.listening)[: len(one.evidence)]
+    steps = np.minimum(step_at(onsets_s, STEP_S), len(listening) - 1)
     one_speaks, own_voice_s, known, looked_at = one.evidence[
         :, [AT[name] for name in ("one_speaks", "own_voice_s", "gaze_known", "looked_at")]
     ].T

@@ -102,7 +102,9 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> d
         if kind == "nod" and not all_series:
             learned.weights[: len(PHASE["phrase_s"])] -= LESS  # these are the first inputs, those of silence next
             learned.weights[END_KNOWN] += MORE
-        hazards[kind] = hazard(learned, groups[kind], FROM[kind], event_trainer.rate_per_minute(taught, kind))
+        lessons = [one.lessons[kind] for one in taught if kind in one.lessons]
+        per_minute = sum(len(one.onsets) for one in lessons) / sum(event_trainer.minutes(one.may) for one in lessons)
+        hazards[kind] = hazard(learned, groups[kind], FROM[kind], per_minute)
     motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"]
     hazards["gaze_shift"] = look_away_hazard(hazards["gaze_shift"], taught)
     hazards["blink"] = blink_hazard(motions.gaps)
@@ -221,7 +223,9 @@ def _rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
             "onsets": found["onsets"],
             "a minute": found["per_minute"],
             "AUC on validation": found.get("auc")
-            and "{:.3f} [{:.3f}, {:.3f}]".format(found["auc"], *found["interval"]),
+            and ("{:.3f} [{:.3f}, {:.3f}]" if found["people"] > 1 else "{:.3f}").format(
+                found["auc"], *found["interval"]
+            ),
             "without own voice": found.get("auc_without_own_voice"),
             "expected a minute": found.get("expected_per_minute"),
             "silent head": found.get("expected_per_minute_without_own_voice"),
@@ -256,7 +260,12 @@ def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shap
     rng = np.random.default_rng(0)
     laughs_s += rng.uniform(*sizes.LAUGH_LONGER_S, len(laughs_s))
     laugh, smile = (
-        Shape(duration_s=_quantiles(_smiles_s(seen_s, motions, rng)), size=size)
+        Shape(
+            duration_s=_quantiles(
+                np.array([len(held(pick(motions.smiles, rng), int(seen * FRAME_HZ))) for seen in seen_s]) * FRAME_S
+            ),
+            size=size,
+        )
         for seen_s, size in ((laughs_s, sizes.LAUGH), ((sizes.smile_s(rng) for _ in range(DRAWN)), sizes.SMILE))
     )
     slight, whole = sizes.BLINK
@@ -281,12 +290,6 @@ def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shap
             size=_thousandths(np.interp(_SHARES, *sizes.ASIDE_DEG)),
         ),
     }
-
-
-def _smiles_s(seen_s: Iterable[float], motions: Motions, rng: np.random.Generator) -> Doubles:
-    """Return how long smiles last from onset to offset that are seen so long."""
-    curves = [(pick(motions.smiles, rng), seen) for seen in seen_s]
-    return np.array([len(held(curve, int(seen * FRAME_HZ))) * FRAME_S for curve, seen in curves])
 
 
 def _lengths(spans: Iterable[Doubles]) -> Doubles:

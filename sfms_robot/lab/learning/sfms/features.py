@@ -29,7 +29,6 @@ from sfms_robot.lab.learning.corpus import (
 )
 from sfms_robot.lab.learning.job import Run, Scratch, uniform
 from sfms_robot.listeners.audio_frontend import AudioFrontend
-from sfms_robot.listeners.idle import LATERAL, among_head
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
 from sfms_robot.listeners.sfms.predictor import last_keyframes
@@ -90,7 +89,7 @@ def corpora(
         frontend = AudioFrontend.of(listener) if heard else None
         return gather(dyads, listener.window_frames, space, frontend, listener, run.staging(split))
 
-    return training_data(data, SfmsFrames, listener, listener.window_frames, read)
+    return training_data(data, SfmsFrames, settings, read)
 
 
 def gather(
@@ -158,14 +157,13 @@ def _whole(audio: Floats) -> Floats:
 
 def fit_scales(model: SfmsModel, corpus: SfmsCorpus) -> None:
     """Set the means, deviations and speeds of the model's motion, and its sway where that is apart."""
-    channels = model.settings.channels
-    mean, spread = motion_scales(corpus.frames.motion, channels)
+    mean, spread = motion_scales(corpus.frames.motion, model.settings.channels)
     model.motion_mean.copy_(mean)
     model.motion_std.copy_(spread)
     steps = (corpus.steps(corpus.frames.motion) / model.motion_std).abs().sort(dim=0).values
     model.motion_speed.copy_(steps[int(FASTEST * len(steps))].clamp(min=LEAST_SPEED))
     if model.swaying:
-        fit_sway(model, corpus.by_dyad(corpus.frames.sway), among_head(channels, LATERAL))
+        fit_sway(model, corpus.by_dyad(corpus.frames.sway))
 
 
 def standard_motion(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from sfms_robot import config
@@ -91,7 +91,7 @@ def listener_job(
     levels = codebook.levels if isinstance(codebook, Grid) else None
     costs = torch.tensor(model.tokenizer.costs, device=device)
 
-    def loss_of(step: int, generator: torch.Generator, batch: int) -> Tensor:
+    def loss_of(step: int, generator: Generator, batch: int) -> Tensor:
         chosen = starts[torch.randint(len(starts), (batch,), generator=generator)]
         if phase.event_windows and len(eventful):
             busy = uniform(generator, batch) < phase.event_windows
@@ -168,7 +168,7 @@ class Lessons:
             own = window_tokens(self.model, self.motion, self._dense, starts)
         return context(self.model, self._corpus, own, starts, louder, self._held), own[:, settings.past_frames :]
 
-    def some(self, generator: torch.Generator) -> Iterator[tuple[Context[Tensor], Tensor]]:
+    def some(self, generator: Generator) -> Iterator[tuple[Context[Tensor], Tensor]]:
         """Yield batches of `at` for windows that are drawn."""
         for _ in range(HELD_OUT_BATCHES):
             yield self.at(self.starts[torch.randint(len(self.starts), (HELD_OUT_BATCH,), generator=generator)])
@@ -192,7 +192,7 @@ def corrected(settings: config.Training) -> config.Sfms:
     return settings.listener.model_copy(update={"groups": groups})
 
 
-def _drawn(listener: config.Sfms, target: Tensor, generator: torch.Generator) -> Tensor:
+def _drawn(listener: config.Sfms, target: Tensor, generator: Generator) -> Tensor:
     """Draw how many frames (B, 1), on the CPU, of each future (B, H, G) are drawn already when the rest is planned.
 
     None of them is the paper's training, and that of a listener whose hop is a whole plan: nothing is ever left of the
@@ -230,7 +230,7 @@ def augment(
     levels: Tensor | None,
     neutral: Tensor,
     training: config.PredictorTraining,
-    generator: torch.Generator,
+    generator: Generator,
 ) -> Context[Tensor]:
     """Return contexts with missing modalities, a cold start and a noisy past. `neutral` (P, G)."""
     b, p = seen.heard.shape
@@ -251,7 +251,7 @@ def augment(
     return seen._replace(heard=heard & ~before, face_known=known & ~before, tokens=tokens, control=control)
 
 
-def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torch.Generator) -> Tensor:
+def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: Generator) -> Tensor:
     """Move a share of the keyframes by one level in one dimension: in a roll-out the past is the model's own.
 
     Without levels (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.
@@ -275,7 +275,7 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: torc
 def held_out_loss(lessons: Lessons, phase: config.PredictorTraining) -> float:
     """Return the loss, not augmented, on windows drawn with a fixed seed."""
     model = lessons.model.eval()
-    generator = torch.Generator().manual_seed(0)
+    generator = Generator().manual_seed(0)
     losses = []
     for seen, target in lessons.some(generator):
         meant = torch.cat([seen.tokens[:, : -target.shape[1]], target], dim=1)
@@ -291,7 +291,7 @@ def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, placed: TokensOf = "dy
     """
     model.eval()
     hit = said = true = 0
-    for seen, target in Lessons(model, corpus, placed).some(torch.Generator().manual_seed(0)):
+    for seen, target in Lessons(model, corpus, placed).some(Generator().manual_seed(0)):
         expected = model.predictor.teacher_forced(seen, target).softmax(-1)[..., 0] < 0.5
         key = target > 0
         hit, said, true = hit + int((expected & key).sum()), said + int(expected.sum()), true + int(key.sum())

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 from torch.nn import functional as F
 
 from sfms_robot import config
@@ -103,7 +103,7 @@ def optimizers_of(tokenizer: Tokenizer, phase: config.TokenizerTraining) -> list
     return made
 
 
-def amplified(batch: Tensor, gain: float, generator: torch.Generator) -> Tensor:
+def amplified(batch: Tensor, gain: float, generator: Generator) -> Tensor:
     """Scale the motion of windows (B, T, C), all channels alike; `gain`: deviation of the logarithm of the factor.
 
     A few faces do not hold what the next face does at its widest. The best masks stay the best.
@@ -124,7 +124,7 @@ def loss_of_steps(
     if isinstance(tokenizer.score, ScoreNetwork):
         starts = first_frames(lengths, tokenizer.window)
 
-        def jointly(step: int, generator: torch.Generator, samples: int) -> Tensor:
+        def jointly(step: int, generator: Generator, samples: int) -> Tensor:
             chosen = starts[torch.randint(len(starts), (samples,), generator=generator)]
             hot, cold = phase.temperature
             temperature = hot * (cold / hot) ** (step / max(1, phase.steps - 1))
@@ -135,7 +135,7 @@ def loss_of_steps(
     draw = batches(tokenizer, motion, lengths, phase.steps * phase.batch)
     score, most = tokenizer.score, max(tokenizer.keyframes)
 
-    def beside(step: int, generator: torch.Generator, samples: int) -> Tensor:
+    def beside(step: int, generator: Generator, samples: int) -> Tensor:
         batch, mask = draw(samples, generator)
         batch = amplified(batch, gain, generator)
         loss = tokenizer_loss(tokenizer, batch, mask, phase, generator)[0]
@@ -176,7 +176,7 @@ def tokenizer_loss(
     batch: Tensor,
     mask: Tensor,
     phase: config.TokenizerTraining,
-    generator: torch.Generator,
+    generator: Generator,
 ) -> tuple[Tensor, Tensor]:
     """Return loss (13) without its masking term, and the squared error of each window (B,).
 
@@ -199,7 +199,7 @@ def learned_loss(
     batch: Tensor,
     temperature: float,
     phase: config.TokenizerTraining,
-    generator: torch.Generator,
+    generator: Generator,
 ) -> Tensor:
     """Return loss (13) with placements sampled by Algorithm 1; the best of `DRAWS` is I* of equation (7)."""
     assert isinstance(tokenizer.score, ScoreNetwork)
@@ -280,7 +280,7 @@ CANDIDATES = 4  # tracks looked at for one that is learned from
 EXPLORED = 0.5  # share of choices that are drawn rather than the highest score
 
 
-def imitation(score: ConditionalScore, track: Tracks, most: int, generator: torch.Generator) -> Tensor:
+def imitation(score: ConditionalScore, track: Tracks, most: int, generator: Generator) -> Tensor:
     """Return the cross-entropy of scores and teacher over all states of one choice of 1..`most` keyframes a track."""
     n = len(track.curves)
     k = torch.randint(1, most + 1, (n,), generator=generator)  # on the CPU: as many states follow
@@ -293,7 +293,7 @@ def imitation(score: ConditionalScore, track: Tracks, most: int, generator: torc
 
 
 @torch.no_grad()
-def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: torch.Generator) -> Tracks:
+def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: Generator) -> Tracks:
     """Draw at most `count` tracks of motion (B, T, C), lively ones more often: a still one has no best keyframes."""
     few = -(-CANDIDATES * count // len(member))  # windows that give enough candidates
     some = motion[torch.randperm(len(motion), generator=generator)[:few].to(motion.device, non_blocking=True)]
@@ -306,9 +306,7 @@ def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: t
 
 
 @torch.no_grad()
-def states(
-    score: ConditionalScore, track: Tracks, k: Tensor, generator: torch.Generator
-) -> tuple[Tensor, Tensor, Tensor]:
+def states(score: ConditionalScore, track: Tracks, k: Tensor, generator: Generator) -> tuple[Tensor, Tensor, Tensor]:
     """Return all states (track row, chosen frames (S, T), keyframes to come) that the choices of the network reach.
 
     `k` (n,) keyframes of each track, of the CPU.
@@ -349,7 +347,7 @@ def regrets(track: Tracks, chosen: Tensor, k: Tensor, most: int) -> Tensor:
 FEW_GROUPS = 8  # up to so many, exact masks of a batch take less time than its step
 MOST_WINDOWS = 2000  # of which masks are kept; more overlap than that teaches little
 
-Batch = Callable[[int, torch.Generator], tuple[Tensor, Tensor]]  # batch size -> motion (B, T, C), masks (B, T, G)
+Batch = Callable[[int, Generator], tuple[Tensor, Tensor]]  # batch size -> motion (B, T, C), masks (B, T, G)
 
 
 def teacher(strategy: Strategy) -> Strategy:
@@ -378,7 +376,7 @@ def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn:
     elif strategy in ("penalised", "exact"):
         whole = place_all(tokenizer, motion, lengths)
 
-    def draw(size: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    def draw(size: int, generator: Generator) -> tuple[Tensor, Tensor]:
         chosen = torch.randint(len(starts), (size,), generator=generator)
         batch = windows(motion, starts[chosen], window)
         if kept is not None:

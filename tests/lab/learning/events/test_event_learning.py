@@ -144,6 +144,14 @@ def test_without_people_of_validation_nothing_is_ranked(tmp_path):
     assert load_tables(tmp_path / "events.yaml").hazards["nod"].per_minute > 1
 
 
+def test_one_person_of_validation_is_ranked_without_an_interval(tmp_path):
+    write_tables(tmp_path, meetings=("ES2002a", "IS1000a"))
+    found = train_events(tmp_path, None, False, 1)
+    nods = found["kinds"]["nod"]
+    assert (nods["people"], nods["interval"]) == (1, [None, None])
+    assert found["rows"][0]["AUC on validation"] == f"{nods['auc']:.3f}"
+
+
 def test_smiles_last_as_long_as_composed_ones_and_what_is_saved_is_loaded(tmp_path):
     shipped = EventModel.load().tables
     for kind, (least, most) in {"smile": (2.5, 4.5), "laugh": (2.5, 4.5)}.items():
