@@ -42,11 +42,6 @@ FULL: Final = 2.0  # the intensity at which its columns saturate: shown as 1
 WITHOUT_SHAPE: Final = tuple(unit for unit in FAU_VALUE if unit not in SHAPES_OF_UNIT)
 _SHOWN: Final = {shape for unit in FAU_VALUE for shape in SHAPES_OF_UNIT.get(unit, ())}
 WITHOUT_UNIT: Final = tuple(shape for shape in BLENDSHAPES if shape not in _SHOWN)
-_PLACES: Final = [
-    (column, [BLENDSHAPES.index(shape) for shape in SHAPES_OF_UNIT[unit]])
-    for column, unit in enumerate(FAU_VALUE)
-    if unit in SHAPES_OF_UNIT
-]
 # Of seamless27: rotation from the head at rest, axis-angle in FLAME's axes; intensities of action units.
 SEAMLESS_CHANNELS: Final = (*(f"rotation_{axis}" for axis in "xyz"), *(f"AU{unit}" for unit in FAU_VALUE))
 # Numbers per frame of every space data comes in: those a listener may work in, and two that it may not.
@@ -318,8 +313,9 @@ def by_split(items: Iterable[tuple[Split, _Item]]) -> dict[Split, list[_Item]]:
 def blendshapes_of(intensities: Floats | Doubles) -> Floats:
     """Return blendshapes (N, 52) within 0..1 of intensities (N, 24) in the order of `FAU_VALUE`."""
     out = np.zeros((len(intensities), len(BLENDSHAPES)), np.float32)
-    for column, places in _PLACES:
-        out[:, places] = np.clip(intensities[:, column] / FULL, 0.0, 1.0)[:, None]
+    for column, unit in enumerate(FAU_VALUE):
+        for shape in SHAPES_OF_UNIT.get(unit, ()):
+            out[:, BLENDSHAPES.index(shape)] = np.clip(intensities[:, column] / FULL, 0.0, 1.0)
     return out
 
 

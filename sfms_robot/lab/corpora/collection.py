@@ -288,9 +288,7 @@ def torch_load(file: Path) -> Any:
     """
     import torch
 
-    arrays: list[Callable[..., Any] | tuple[Callable[..., Any], str]] = [
-        (getattr(_module(module), name), f"{module}.{name}") for module, name in sorted(_ARRAY_PARTS)
-    ]
+    arrays: list[Any] = [(getattr(_module(module), name), f"{module}.{name}") for module, name in sorted(_ARRAY_PARTS)]
     arrays += [type(np.dtype(kind)) for kind in ("f2", "f4", "f8", "i2", "i4", "i8", "u1", "?", "U1", "S1")]
     try:
         with torch.serialization.safe_globals(arrays), warnings.catch_warnings():

@@ -29,7 +29,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, ListenerEvent
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import usable
-from sfms_robot.lab.learning.job import Scratch
+from sfms_robot.lab.learning.job import ALONE, Run
 from sfms_robot.lab.learning.training_loop import write_whole
 from sfms_robot.listeners.idle import BANDS, BANDS_HZ, LATERAL, among_head, head_channels
 from sfms_robot.listeners.space import MotionSpace
@@ -120,17 +120,20 @@ def gather(
     scenes: Mapping[str, Sequence[Dyad]],
     window: int,
     frames_of: Callable[[Dyad], Frames],
-    scratch: Scratch | None = None,
+    run: Run = ALONE,
+    split: str = "",
 ) -> Corpus[Frames]:
     """Stack dyads, read one at a time; those shorter than a window are left out and counted.
 
-    `scratch`: on disk, where the first process of each machine stages them and the others wait.
+    With `run.scratch` they are stacked in its folder `split`: the first process of each machine stages them there, and
+    the others wait.
 
     Raises ConfigError when none is left, and whatever `frames_of` raises.
     """
-    if scratch is not None and scratch.group.local_rank:
-        scratch.group.wait()
-        return read_staged(frames_of(next(iter(usable(next(iter(scenes.values())))))), scratch.folder)
+    folder = None if run.scratch is None else run.scratch / split
+    if folder is not None and run.group.local_rank:
+        run.group.wait()
+        return read_staged(frames_of(next(iter(usable(next(iter(scenes.values())))))), folder)
     parts: list[Frames] = []
     lengths: list[int] = []
     named: list[str] = []
@@ -141,10 +144,10 @@ def gather(
                 short += 1
                 continue
             one = frames_of(dyad)
-            if scratch is None:
+            if folder is None:
                 parts.append(one)
             else:
-                _stage(one, scratch.folder, first=not lengths)
+                _stage(one, folder, first=not lengths)
             lengths.append(len(dyad.listener))
             named.append(scene)
     total = sum(map(len, scenes.values()))
@@ -153,11 +156,11 @@ def gather(
         raise ConfigError(f"none of {total} dyads can be used: {left_out}")
     if len(lengths) < total:
         log.warning("%d of %d dyads are used: %s", len(lengths), total, left_out)
-    if scratch is not None:
-        with _writing(scratch.folder):
-            (scratch.folder / _INDEX).write_text(json.dumps({"lengths": lengths, "scenes": named}), encoding="utf-8")
-        scratch.group.wait()
-        return read_staged(one, scratch.folder)
+    if folder is not None:
+        with _writing(folder):
+            (folder / _INDEX).write_text(json.dumps({"lengths": lengths, "scenes": named}), encoding="utf-8")
+        run.group.wait()
+        return read_staged(one, folder)
     joined = {name: torch.cat([vars(part)[name] for part in parts]) for name in vars(one)}
     return Corpus(replace(one, **joined), tuple(lengths), tuple(named))
 

@@ -107,11 +107,11 @@ def joined(device: torch.device) -> Iterator[ProcessGroup]:
 
     Raises ConfigError, GroupError.
     """
-    size = _number("WORLD_SIZE", 1)
+    size, restarts = _number("WORLD_SIZE", 1), _number("TORCHELASTIC_RESTART_COUNT", 0)
     if size == 1:
-        yield ProcessGroup(restarts=_number("TORCHELASTIC_RESTART_COUNT", 0))
+        yield ProcessGroup(restarts=restarts)
         return
-    group = ProcessGroup(_number("RANK", 0), size, local_rank(), _number("TORCHELASTIC_RESTART_COUNT", 0))
+    group = ProcessGroup(_number("RANK", 0), size, local_rank(), restarts)
     if device.type == "cuda":
         torch.cuda.set_device(device)
     with group.talking():
@@ -235,14 +235,6 @@ class Report:
     looked: bool
 
 
-@dataclass(frozen=True)
-class Scratch:
-    """Folder of staged frames, and the processes that read them."""
-
-    folder: Path
-    group: ProcessGroup
-
-
 @dataclass(frozen=True, kw_only=True)
 class Run:
     """Settings of running a job that do not change its weights.
@@ -265,10 +257,6 @@ class Run:
     accumulate: int | None = None
     scratch: Path | None = None
     read_every: int | None = None
-
-    def staging(self, name: str) -> Scratch | None:
-        """Return where frames of this name are staged, if they are."""
-        return None if self.scratch is None else Scratch(self.scratch / name, self.group)
 
 
 ALONE: Final = Run()  # one process, on the CPU, from the first step

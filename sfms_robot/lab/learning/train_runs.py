@@ -368,25 +368,21 @@ def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
 def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[Job]:
     """Yield the job of each stage, on initial weights and made-up frames."""
     torch.manual_seed(settings.seed)
-    listener = settings.listener
-    space = MotionSpace.of(listener)
+    space = MotionSpace.of(settings.listener)
     if isinstance(settings, config.ArigTraining):
-        phase = settings.training
-        student = Student(ArigModel(settings.listener))
-        dyads = _made_up(phase.window_frames + FRAME_HZ, listener)
-        corpus = arig_features.gather(
-            dict.fromkeys(arig_features.SCENES, dyads), phase.window_frames, space, settings.listener
-        )
+        arig, window = settings.listener, settings.training.window_frames
+        student = Student(ArigModel(arig))
+        scenes = dict.fromkeys(arig_features.SCENES, _made_up(window + FRAME_HZ, arig))
+        corpus = arig_features.gather(scenes, window, space, arig)
         arig_features.fit_scales(student.model, corpus)
         yield arig_job(settings, student, corpus, corpus, CPU)
         return
-    window = settings.listener.window_frames
-    dyads = _made_up(2 * window, listener)
-    plain = gather(dyads, window, space, None, settings.listener)
-    model = SfmsModel(settings.listener)
+    sfms, window = settings.listener, settings.listener.window_frames
+    dyads, model = _made_up(2 * window, sfms), SfmsModel(sfms)
+    plain = gather(dyads, window, space, None, sfms)
     fit_scales(model, plain)
     yield tokenizer.tokenizer_job(settings, model, plain, plain, CPU)
-    heard = gather(dyads, window, space, AudioFrontend.of(settings.listener), settings.listener)
+    heard = gather(dyads, window, space, AudioFrontend.of(sfms), sfms)
     fit_sound(model.cpu(), (heard.frames.sound, heard.frames.heard))
     yield listener.listener_job(settings, model, heard, heard, CPU)
 

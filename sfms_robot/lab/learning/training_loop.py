@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 def optimizer(parameters: Iterable[nn.Parameter], rate: float, decay: float) -> torch.optim.Optimizer:
     """Return AdamW with the paper's betas (V-A), in one kernel on a GPU."""
     learned = list(parameters)
-    fused = bool(learned) and learned[0].is_cuda or None
+    fused = learned[0].is_cuda or None
     return torch.optim.AdamW(learned, lr=rate, betas=(0.9, 0.98), weight_decay=decay, fused=fused)
 
 

@@ -31,7 +31,7 @@ from sfms_robot.lab.learning.corpus import (
     motion_scales,
     shared_frames,
 )
-from sfms_robot.lab.learning.job import Scratch
+from sfms_robot.lab.learning.job import ALONE, Run
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.arig import event_curves
 from sfms_robot.listeners.arig.model import ArigDyad, ArigModel
@@ -87,10 +87,11 @@ def gather(
     window: int,
     space: MotionSpace,
     settings: config.Arig,
-    scratch: Scratch | None = None,
+    run: Run = ALONE,
+    split: str = "",
 ) -> ArigCorpus:
     """Run `corpus.gather` in one motion space, for a listener of these settings."""
-    return dyads.gather(scenes, window, partial(frames_of, space=space, settings=settings), scratch)
+    return dyads.gather(scenes, window, partial(frames_of, space=space, settings=settings), run, split)
 
 
 def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:

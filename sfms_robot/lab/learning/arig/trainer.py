@@ -78,7 +78,7 @@ def corpora(settings: config.ArigTraining, data: Path, run: Run) -> dict[str, Ar
     window, listener = settings.training.window_frames, settings.listener
 
     def read(split: str) -> ArigCorpus:
-        return gather(open_scenes(data, split), window, MotionSpace.of(listener), listener, run.staging(split))
+        return gather(open_scenes(data, split), window, MotionSpace.of(listener), listener, run, split)
 
     return training_data(data, LabelledDyad, settings, read)
 

@@ -27,7 +27,7 @@ from sfms_robot.lab.learning.corpus import (
     training_data,
     windows,
 )
-from sfms_robot.lab.learning.job import Run, Scratch, uniform
+from sfms_robot.lab.learning.job import ALONE, Run, uniform
 from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 from sfms_robot.listeners.sfms.model import SfmsModel, Tokenizer
@@ -87,7 +87,7 @@ def corpora(
                 data, dyads.fps, FRAME_HZ,
             )  # fmt: skip
         frontend = AudioFrontend.of(listener) if heard else None
-        return gather(dyads, listener.window_frames, space, frontend, listener, run.staging(split))
+        return gather(dyads, listener.window_frames, space, frontend, listener, run, split)
 
     return training_data(data, SfmsFrames, settings, read)
 
@@ -98,7 +98,8 @@ def gather(
     space: MotionSpace,
     frontend: AudioFrontend | None = None,
     settings: config.Sfms | None = None,
-    scratch: Scratch | None = None,
+    run: Run = ALONE,
+    split: str = "",
 ) -> SfmsCorpus:
     """Run `corpus.gather` in one motion space.
 
@@ -106,7 +107,7 @@ def gather(
     `settings`: of a listener that may get events; None: one that does not.
     """
     one = partial(frames_of, space=space, frontend=frontend, settings=settings)
-    return dyads.gather({"listening": listened}, window, one, scratch)
+    return dyads.gather({"listening": listened}, window, one, run, split)
 
 
 def frames_of(
@@ -312,11 +313,12 @@ def without_last_keyframes(
         tokens: what was meant; dense: (B, T, G) what each frame's keyframe would be.
         motion: (B, T, C) standardised; member: (G, C); costs: (G,) of a keyframe, in squared units of the motion.
         first: (B,) the first frame to draw, above 0.
+        generator: on the device of the tokens.
     """
     b, t, groups = tokens.shape
     row, frame = torch.arange(b, device=tokens.device)[:, None], torch.arange(t, device=tokens.device)
     recent = (frame >= first[:, None] - MISSED_FRAMES) & (frame < first[:, None])
-    chosen = (uniform(generator, b, 1, groups) < share).to(tokens.device)
+    chosen = uniform(generator, b, 1, groups) < share
     left = torch.where(recent[..., None] & chosen, 0, tokens)
     last = last_keyframes(left).at[row[:, 0], first - 1][..., 0]  # (B, G)
     off = motion[row, last.clamp(min=0)] - motion[row[:, 0], first][:, None]  # (B, G, C)

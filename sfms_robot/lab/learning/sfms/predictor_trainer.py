@@ -232,15 +232,18 @@ def augment(
     training: config.PredictorTraining,
     generator: Generator,
 ) -> Context[Tensor]:
-    """Return contexts with missing modalities, a cold start and a noisy past. `neutral` (P, G)."""
+    """Return contexts with missing modalities, a cold start and a noisy past. `neutral` (P, G).
+
+    All of it and the generator are on one device (`learning.job.noise_of`).
+    """
     b, p = seen.heard.shape
     device = seen.tokens.device
-    heard = seen.heard & (uniform(generator, b, 1) >= training.drop_audio).to(device)
-    known = seen.face_known & (uniform(generator, b, 1) >= training.drop_face).to(device)
+    heard = seen.heard & (uniform(generator, b, 1) >= training.drop_audio)
+    known = seen.face_known & (uniform(generator, b, 1) >= training.drop_face)
     past = perturb(seen.tokens[:, :p], levels, training.history_noise, generator)
     # Neutral prefix (IV-C): the first frames are as a stream begins, with nothing heard or seen.
-    cold = (uniform(generator, b, 1) < training.neutral_prefix).to(device)
-    cut = torch.randint(1, p + 1, (b, 1), generator=generator, device=generator.device).to(device)
+    cold = uniform(generator, b, 1) < training.neutral_prefix
+    cut = torch.randint(1, p + 1, (b, 1), generator=generator, device=device)
     frame = torch.arange(p, device=device)
     before = cold & (frame < cut)
     shifted = neutral[(frame - cut) % p]  # (B, P, G): its end at the cut
@@ -259,14 +262,14 @@ def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: Gene
     if not is_drawn(generator, share):
         return tokens
     place = generator.device
-    changed = (tokens > 0) & (uniform(generator, *tokens.shape) < share).to(tokens.device)
+    changed = (tokens > 0) & (uniform(generator, *tokens.shape) < share)
     if levels is None:
         return torch.where(changed, 0, tokens)
     codes = indices_to_codes((tokens - 1).clamp(min=0), levels)
     dims = levels.shape[1]
     dimension = torch.randint(dims, tokens.shape, generator=generator, device=place)
     sign = torch.randint(2, tokens.shape, generator=generator, device=place)[..., None] * 2 - 1
-    moved = (torch.nn.functional.one_hot(dimension, dims) * sign).to(tokens.device)
+    moved = F.one_hot(dimension, dims) * sign
     noisy = (codes + moved * 2 / (levels - 1)).clamp(-1.0, 1.0)
     return torch.where(changed, codes_to_indices(noisy, levels) + 1, tokens)
 

@@ -300,16 +300,16 @@ def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: G
     found = tracks(some, member, curves)
     around = (some - some.mean(1, keepdim=True)).square().mean(1) @ member.T  # (B, G)
     noise = noise_of(generator, motion.device)
-    weight = around.float().flatten().clamp(max=1.0).sqrt().to(noise.device) + 0.05
+    weight = around.float().flatten().clamp(max=1.0).sqrt() + 0.05
     rows = torch.multinomial(weight, min(count, len(weight)), generator=noise)
-    return found[rows.to(motion.device)]
+    return found[rows]
 
 
 @torch.no_grad()
 def states(score: ConditionalScore, track: Tracks, k: Tensor, generator: Generator) -> tuple[Tensor, Tensor, Tensor]:
     """Return all states (track row, chosen frames (S, T), keyframes to come) that the choices of the network reach.
 
-    `k` (n,) keyframes of each track, of the CPU.
+    `k` (n,) keyframes of each track, of the CPU; the generator is on the device of the tracks.
     """
     n, t, _ = track.curves.shape
     mask = track.curves.new_zeros(n, t)
@@ -321,8 +321,8 @@ def states(score: ConditionalScore, track: Tracks, k: Tensor, generator: Generat
         chosen.append(mask[here])
         remaining.append(to_come[here])
         logits = score(track, mask, to_come.clamp(min=1))
-        noise = -torch.log(-torch.log(uniform(generator, n, t).to(mask.device).clamp(1e-7, 1 - 1e-7)))
-        drawn = uniform(generator, n).to(mask.device) < EXPLORED
+        noise = -torch.log(-torch.log(uniform(generator, n, t).clamp(1e-7, 1 - 1e-7)))
+        drawn = uniform(generator, n) < EXPLORED
         picked = (logits + noise * drawn[:, None]).argmax(1, keepdim=True)
         mask = mask.scatter(1, picked, 1.0)
     return torch.cat(rows), torch.cat(chosen), torch.cat(remaining)
