@@ -26,8 +26,7 @@ def meeting_person(**changes) -> MeetingPerson:
     """One to whom nothing happens in a meeting of five minutes, and who does nothing."""
     spans = "nods shakes tilts unseen laughs mm_hms talk backchannels others others_laughs others_backchannels".split()
     whole = {
-        "others_nods": (), "looked_at": (), "gaze_known": frozenset(), "words": {},
-        "meeting": "M1a", "agent": "B", "participant": "P1", "until_s": 300.0, "gaze": None, "floor": (),
-        "asked": np.zeros(0),
+        "meeting": "M1a", "agent": "B", "participant": "P1", "until_s": 300.0, "asked": np.zeros(0), "words": {},
+        "gaze": None, "gaze_known": frozenset(), "floor": (), "others_nods": (), "looked_at": (),
     }  # fmt: skip
     return MeetingPerson(**dict.fromkeys(spans, NONE) | whole | changes)

@@ -25,8 +25,10 @@ from sfms_robot.lab.corpora.compose.composed import compose_folder
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, FIGURES, Residual, to_ours
 from sfms_robot.signals.spaces import FlameMatrix, read_matrix
 
+Figures = dict[str, Any]  # for JSON
 
-def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: bool, jobs: int) -> dict[str, Any]:
+
+def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: bool, jobs: int) -> Figures:
     """Compose into out/train, out/validation and out/test. Returns the minutes written per split."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
@@ -38,7 +40,7 @@ def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: b
 # --- `data check` ---------------------------------------------------------------------------------------------------
 
 
-def check_data(folder: Path, layout: str = "auto", order: Order | None = None, window: int = 0) -> dict[str, Any]:
+def check_data(folder: Path, layout: str = "auto", order: Order | None = None, window: int = 0) -> Figures:
     """Read every split of a folder.
 
     Args:
@@ -65,7 +67,7 @@ def check_data(folder: Path, layout: str = "auto", order: Order | None = None, w
     }
 
 
-def _checked(layout: Layout, place: Path, split: str, order: Order | None, window: int) -> dict[str, Any]:
+def _checked(layout: Layout, place: Path, split: str, order: Order | None, window: int) -> Figures:
     """Read every clip of a split; return its report."""
     try:
         dataset = formats.scan_split(layout, place, split, order)
@@ -158,7 +160,7 @@ class _Tally:
         for name, found in self._missing.items():
             yield from (one for one in found if self.features[name] or one.kind != "missing feature")
 
-    def channels(self, space: str, frames: int) -> list[dict[str, Any]]:
+    def channels(self, space: str, frames: int) -> list[Figures]:
         """Return range, mean and standard deviation of each channel over all frames."""
         if not self._motion:
             return []
@@ -182,7 +184,7 @@ def convert_data(
     order: Order | None = None,
     flame_matrix: Path | None = None,
     flame_order: str = "alphabetical",
-) -> dict[str, Any]:
+) -> Figures:
     """Write every split of `folder` as out/SPLIT/NAME.npz in `arkit58` at 25 fps, and out/source.yaml with their
     licence.
 
@@ -239,7 +241,7 @@ def _matrix(space: str, file: Path | None, order: str) -> FlameMatrix | None:
 
 def _converted(
     dataset: Dataset, out: Path, residual: Residual, flame: FlameMatrix | None, order: Order | None
-) -> dict[str, Any]:
+) -> Figures:
     """Convert every clip of a split, write it, and compare the motion that is read back; return the split's report."""
     if said := formats.wrong_order(dataset, order):
         raise ConfigError(f"{dataset.split}: {said}")

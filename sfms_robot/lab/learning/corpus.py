@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from sfms_robot.listeners.arig.model import ArigModel
     from sfms_robot.listeners.sfms.model import SfmsModel
 
+AnyTraining = config.Training | config.ArigTraining
 Frames = TypeVar("Frames", bound="DataclassInstance")
 
 GAZE = [CHANNEL_INDEX[name] for name in GAZE_CHANNELS]
@@ -336,14 +337,14 @@ PACK_VERSION: Final = 1
 _MADE_FOR: Final = ("kind", "motion_space", "neutral", "metres_per_unit", "sound", "audio", "phase", "events", "sway")
 
 
-def _made_for(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
+def _made_for(settings: AnyTraining) -> dict[str, Any]:
     """Return the settings that frames depend on, as plain data."""
     windows = settings.training if isinstance(settings, config.ArigTraining) else settings.listener
     known = settings.listener.model_dump(mode="json")
     return {**{name: known.get(name) for name in _MADE_FOR}, "window": windows.window_frames}
 
 
-def write_pack(file: Path, corpora: Mapping[str, Corpus[Any]], settings: config.Training | config.ArigTraining) -> None:
+def write_pack(file: Path, corpora: Mapping[str, Corpus[Any]], settings: AnyTraining) -> None:
     """Write corpora by split to a file, in one move. Raises ConfigError."""
     tensors = {
         f"{split}.{name}": tensor.contiguous()
@@ -358,7 +359,7 @@ def write_pack(file: Path, corpora: Mapping[str, Corpus[Any]], settings: config.
 def training_data(
     data: Path,
     frames: type[Frames],
-    settings: config.Training | config.ArigTraining,
+    settings: AnyTraining,
     read: Callable[[str], Corpus[Frames]],
 ) -> dict[str, Corpus[Frames]]:
     """Return the frames of train and validation: of the pack `data`, or as `read` returns a split of a folder.

@@ -43,7 +43,7 @@ from sfms_robot.lab.evaluation.rollout import offline_rollout
 from sfms_robot.lab.learning.arig import features as arig_features
 from sfms_robot.lab.learning.arig.trainer import Student, arig_job, train_arig
 from sfms_robot.lab.learning.arig.trainer import corpora as arig_corpora
-from sfms_robot.lab.learning.corpus import Corpus, fit_sound, without_gaze, write_pack
+from sfms_robot.lab.learning.corpus import AnyTraining, Corpus, fit_sound, without_gaze, write_pack
 from sfms_robot.lab.learning.job import (
     ALONE,
     Job,
@@ -68,6 +68,7 @@ from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.listeners.torch_engine import torch_engine
 
+Figures = dict[str, Any]  # for JSON
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -99,7 +100,7 @@ class TrainOptions:
     scratch: Path | None = None
 
 
-def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
+def train_tokenizer(options: TrainOptions) -> Figures:
     """Train phase 1. Returns its figures and minutes."""
     settings, began_s = train_settings(options, "tokenizer"), time.monotonic()
     if isinstance(settings, config.ArigTraining):
@@ -109,7 +110,7 @@ def train_tokenizer(options: TrainOptions) -> dict[str, Any]:
     return _told(figures, run, began_s)
 
 
-def train_listener(options: TrainOptions) -> dict[str, Any]:
+def train_listener(options: TrainOptions) -> Figures:
     """Train SFMS: phase 2, on the tokenizer in `options.out`; or all of ARIG. Returns its figures and minutes."""
     settings, began_s = train_settings(options, "predictor"), time.monotonic()
     if isinstance(settings, config.ArigTraining):
@@ -130,12 +131,12 @@ def train_listener(options: TrainOptions) -> dict[str, Any]:
     return _told(figures, run, began_s)
 
 
-def _told(figures: dict[str, Any], run: Run, began_s: float) -> dict[str, Any]:
+def _told(figures: Figures, run: Run, began_s: float) -> Figures:
     """Return the figures and the minutes they took, of the first process alone."""
     return {**figures, "minutes": round((time.monotonic() - began_s) / 60, 2)} if run.group.first else {}
 
 
-def pack_data(file: Path, data: Path, out: Path, order: Order | None = None) -> dict[str, Any]:
+def pack_data(file: Path, data: Path, out: Path, order: Order | None = None) -> Figures:
     """Write all that the training of a file reads of its data to `out`. Returns dyads, frames and bytes."""
     settings = load_training(file)
     found: Mapping[str, Corpus[Any]] = (
@@ -157,7 +158,7 @@ def device_of(name: str) -> torch.device:
     return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
 
 
-def train_settings(options: TrainOptions, phase: str = "training") -> config.Training | config.ArigTraining:
+def train_settings(options: TrainOptions, phase: str = "training") -> AnyTraining:
     """Read the training file and apply the options; `phase` is the one whose steps they mean."""
     settings = load_training(options.file)
     raw = settings.model_dump(mode="json")
@@ -355,7 +356,7 @@ ASSUMED: Final = (
 )
 
 
-def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
+def dry_run(settings: AnyTraining) -> Figures:
     """Return figures of every stage, and hours of all their steps.
 
     Blocks: up to minutes at the paper's sizes on a small machine, most of it backward passes.
@@ -365,7 +366,7 @@ def dry_run(settings: config.Training | config.ArigTraining) -> dict[str, Any]:
     return {"stages": stages, "hours": hours, "assumed": ASSUMED, "rows": [_row(stage) for stage in stages]}
 
 
-def jobs_of(settings: config.Training | config.ArigTraining) -> Iterator[Job]:
+def jobs_of(settings: AnyTraining) -> Iterator[Job]:
     """Yield the job of each stage, on initial weights and made-up frames."""
     torch.manual_seed(settings.seed)
     space = MotionSpace.of(settings.listener)
@@ -417,7 +418,7 @@ def _made_up(frames: int, listener: config.Sfms | config.Arig) -> list[Dyad]:
     return found
 
 
-def _measured(job: Job) -> dict[str, Any]:
+def _measured(job: Job) -> Figures:
     """Measure one piece of a batch and the update after it; all pieces of a batch are alike."""
     batch, window = job.phase.batch, job.frames_per_step // job.phase.batch
     samples = max((n for n in range(1, batch + 1) if batch % n == 0 and n * window <= MOST_FRAMES), default=1)
@@ -462,7 +463,7 @@ def _measured(job: Job) -> dict[str, Any]:
     }
 
 
-def _row(stage: dict[str, Any]) -> dict[str, Any]:
+def _row(stage: Figures) -> Figures:
     return {
         "stage": stage["stage"],
         "million weights": round(stage["params"] / 1e6, 1),

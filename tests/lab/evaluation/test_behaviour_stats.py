@@ -45,8 +45,8 @@ def test_nods_that_a_listener_draws_are_as_long_as_peoples():
     nods = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"].nods
     for seed in range(200):
         event, motion = model.shaped("nod", 100, seed), still(9)
-        nod = replace(event, start_s=2.0)
-        motion[:, CHANNEL_INDEX["pitch"]] = nod_curve(nod, 0.8, nods[seed % len(nods)], len(motion))
+        curve = nod_curve(replace(event, start_s=2.0), 0.8, nods[seed % len(nods)], len(motion))
+        motion[:, CHANNEL_INDEX["pitch"]] = curve
         drawn.append(motion)
     _, length_s, cycle_s, _ = np.median(detection.nods_of(drawn), axis=0)
     assert 0.8 < length_s / 0.50 < 1.25 and 0.8 < cycle_s / 0.20 < 1.25

@@ -31,6 +31,7 @@ _COLUMNS: Final = {
     "dialogue_acts": ("meeting", "agent", "start_s", "end_s", "type"),
 }
 LabelledSpan = tuple[float, float, str]  # start, end [s], and what or which agent
+LabelledSpans = tuple[LabelledSpan, ...]
 _Spans = dict[tuple[str, str], list[LabelledSpan]]
 
 
@@ -66,18 +67,18 @@ class MeetingPerson:
     shakes: Doubles
     tilts: Doubles
     unseen: Doubles
-    gaze: tuple[LabelledSpan, ...] | None
+    gaze: LabelledSpans | None
     laughs: Doubles
     talk: Doubles
     backchannels: Doubles
     others: Doubles
-    floor: tuple[LabelledSpan, ...]
+    floor: LabelledSpans
     others_laughs: Doubles
     asked: Doubles
     others_backchannels: Doubles
     mm_hms: Doubles
-    others_nods: tuple[LabelledSpan, ...]
-    looked_at: tuple[LabelledSpan, ...]
+    others_nods: LabelledSpans
+    looked_at: LabelledSpans
     gaze_known: frozenset[str]
     words: Mapping[str, Doubles]
 
@@ -170,7 +171,7 @@ def split_series(people: Iterable[MeetingPerson]) -> dict[Split, list[MeetingPer
     return parts
 
 
-def _of_others(spans: _Spans, others: Iterable[tuple[str, str]], wanted: tuple[str, ...]) -> tuple[LabelledSpan, ...]:
+def _of_others(spans: _Spans, others: Iterable[tuple[str, str]], wanted: tuple[str, ...]) -> LabelledSpans:
     """Return (start, end, agent) of what the others did, by start."""
     return tuple(
         sorted((start, end, other[1]) for other in others for start, end, what in spans[other] if what in wanted)

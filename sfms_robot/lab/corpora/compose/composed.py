@@ -36,7 +36,14 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Bools, Doubles, Floats
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save, states_of
 from sfms_robot.lab.corpora.compose import speaking
-from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson, interval_table, read_people, split_series
+from sfms_robot.lab.corpora.compose.ami import (
+    LabelledSpan,
+    LabelledSpans,
+    MeetingPerson,
+    interval_table,
+    read_people,
+    split_series,
+)
 from sfms_robot.lab.corpora.compose.motions import Rng, first_frame, pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act, speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import Dwell, away, learn_dwell
@@ -408,7 +415,7 @@ def spans_by(told: Sequence[LabelledSpan], agent: str | None = None) -> Doubles:
     return interval_table((a, b) for a, b, who in told if agent in (None, who))
 
 
-def _looks(stretch: Stretch, dwell: Dwell, rng: Rng) -> tuple[LabelledSpan, ...]:
+def _looks(stretch: Stretch, dwell: Dwell, rng: Rng) -> LabelledSpans:
     """Return looks away from the person with the floor, in seconds of the stretch: annotated, or drawn."""
     if stretch.person.gaze is None:
         return dwell.looks(stretch.frames * FRAME_S, rng)

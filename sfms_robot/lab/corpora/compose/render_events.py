@@ -54,6 +54,7 @@ _MIRROR: Final = [BLENDSHAPES.index(other_side(name)) for name in BLENDSHAPES]
 _TURNED: Final = [CHANNEL_INDEX[name] for name in LATERAL_POSE]
 
 
+Events = list[ListenerEvent]
 NO_SPANS: Final = np.zeros((0, 2))
 NEVER: Final = np.zeros(0)
 
@@ -225,9 +226,7 @@ def nod_curve(nod: ListenerEvent, fall: float, shape: Floats, frames: int) -> Fl
     return out.astype(np.float32)
 
 
-def _swing(
-    pose: Floats, kind: Literal["nod", "shake"], spans: Doubles, motions: Motions, rng: Rng
-) -> list[ListenerEvent]:
+def _swing(pose: Floats, kind: Literal["nod", "shake"], spans: Doubles, motions: Motions, rng: Rng) -> Events:
     """Add nods or shakes to a pose (N, 6)."""
     habit, events = nod_habit(rng), []
     for start, end in spans.tolist():
@@ -240,7 +239,7 @@ def _swing(
     return events
 
 
-def _tilt(pose: Floats, spans: Doubles, rng: Rng) -> list[ListenerEvent]:
+def _tilt(pose: Floats, spans: Doubles, rng: Rng) -> Events:
     """Add tilts to a pose (N, 6)."""
     events = []
     for start, end in spans:
@@ -269,7 +268,7 @@ def _look(motion: Floats, targets: Floats, seed: int) -> Floats:
     return head
 
 
-def _targets(score: Score, rng: Rng) -> tuple[Floats, list[ListenerEvent]]:
+def _targets(score: Score, rng: Rng) -> tuple[Floats, Events]:
     """Return gaze targets (N, 2) yaw and pitch [rad] in steps, the speaker straight ahead, and the gaze shifts."""
     seats: dict[str, tuple[float, float]] = {}
     out = np.zeros((score.frames, 2), np.float32)
@@ -282,7 +281,7 @@ def _targets(score: Score, rng: Rng) -> tuple[Floats, list[ListenerEvent]]:
     return out, _shifts(out)
 
 
-def _shifts(targets: Floats) -> list[ListenerEvent]:
+def _shifts(targets: Floats) -> Events:
     """Return one event at each step of the targets (N, 2); before the first frame the listener looked at the person."""
     before = np.concatenate([np.zeros((1, 2), np.float32), targets])
     at = np.flatnonzero((np.diff(before, axis=0) != 0).any(axis=1)).tolist()
@@ -326,7 +325,7 @@ def _idle(motions: Motions, frames: int, rng: Rng) -> Floats:
     return np.asarray(rng.uniform(0.7, 1.2) * (moving - np.percentile(moving, 20, axis=0)), np.float32)
 
 
-def _smile(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[ListenerEvent]:
+def _smile(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> Events:
     """Lay smiles: own laughs and returned smiles always, laughs of others often, backchannels and nods seldom.
 
     Only a laugh opens the jaw.
@@ -345,7 +344,7 @@ def _smile(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[Lis
         some = [a for a, _ in spans if rng.random() < sizes.SMILES_AFTER[kind]]
         wanted += [("smile", a, sizes.smile_s(rng), rng.uniform(0.3, 0.5), 0.1) for a in some]
     wanted += [("smile", a + 0.2, b - a, max(size, sizes.SMILE[0]), 0.1) for a, b, size in score.smiles]
-    events: list[ListenerEvent] = []
+    events: Events = []
     for kind, start, seen_s, size, jaw in sorted(wanted, key=lambda one: (one[0] != "laugh", one[1])):
         if any(event.start_s - seen_s < start < event.end_s for event in events):
             continue
@@ -373,11 +372,11 @@ def lay_smile(
     return curve
 
 
-def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[ListenerEvent]:
+def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> Events:
     """Raise the brows after half of the questions and with some of the nods."""
     at = [instant for instant in score.asked if rng.random() < 0.5]
     at += [start for start, _ in score.nods if rng.random() < 0.15]
-    events: list[ListenerEvent] = []
+    events: Events = []
     for instant in sorted(at):
         if events and instant - 0.1 < events[-1].end_s:
             continue
@@ -389,7 +388,7 @@ def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> li
     return events
 
 
-def _speak(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[ListenerEvent]:
+def _speak(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> Events:
     """Lay the listener's own words: the mouth of the voice, or some recorded mouth over them, small for an "mm-hm".
 
     The size of an "mm-hm" is how far it opens the jaw.
@@ -412,7 +411,7 @@ def _speak(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> list[Lis
     return events
 
 
-def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: Rng) -> list[ListenerEvent]:
+def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: Rng) -> Events:
     """Lay blinks at recorded intervals and a personal rate; half wait for a cue (gaze shift, phrase end) nearby."""
     end_s = len(shapes) * FRAME_S
     pace, gaps = rng.uniform(0.75, 1.4), np.concatenate(motions.gaps)
@@ -422,7 +421,7 @@ def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: Rng) -> list[Li
         times.append(float(rng.choice(near)) if len(near) and rng.random() < 0.5 else at)
         at += pace * float(rng.choice(gaps))
     times += [cue for cue in cues if rng.random() < 0.08]
-    events: list[ListenerEvent] = []
+    events: Events = []
     for instant in sorted(times):
         if events and instant - events[-1].start_s < 0.5:
             continue

@@ -14,7 +14,7 @@ import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats
 from sfms_robot.lab.corpora.clips import Dyad, states_of_activity
-from sfms_robot.lab.corpora.compose.ami import LabelledSpan, MeetingPerson, interval_table
+from sfms_robot.lab.corpora.compose.ami import LabelledSpan, LabelledSpans, MeetingPerson, interval_table
 from sfms_robot.lab.corpora.compose.motions import Rng, pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, room
@@ -105,7 +105,7 @@ class Dwell:
     at_s: tuple[float, ...]
     away: tuple[tuple[float, str], ...]
 
-    def looks(self, length_s: float, rng: Rng) -> tuple[LabelledSpan, ...]:
+    def looks(self, length_s: float, rng: Rng) -> LabelledSpans:
         """Draw looks away in `length_s` seconds; none where nothing was learned."""
         found: list[LabelledSpan] = []
         if not self.at_s or not self.away:

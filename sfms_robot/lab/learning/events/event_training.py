@@ -43,6 +43,8 @@ from sfms_robot.listeners.events.model import STEP_S, EventModel, EventTables, H
 from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
+Figures = dict[str, Any]  # for JSON
+
 # Part of people's nods begin in the 0.2 s after a phrase in which no head can know that it is over: the fit sees them
 # within phrases, and a head's begin 0.12 s after they are decided. So fewer of a head's nods follow a phrase than of
 # people's, unless it nods less while one lasts (by `LESS`), and more at these knots of silence, once the end is known
@@ -72,7 +74,7 @@ e15614560ba7b0c1121e3d82c8a6e29c57cff5bd, Apache-2.0. Blinks, brows and sizes: m
   sfms-robot train events --data DIR --out FILE"""
 
 
-def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> dict[str, Any]:
+def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> Figures:
     """Write `out` (if given) and return the figures. Raises ConfigError, also for tables in which people never do what
     is to be learned, such as gaze or laughs. Without people of validation nothing is ranked.
 
@@ -111,7 +113,7 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> d
     found = EventTables(hazards={kind: hazards[kind] for kind in EVENT_KINDS}, shapes=shapes(taught, motions))
     if out is not None:
         save(out, found)
-    figures: dict[str, Any] = {
+    figures: Figures = {
         "out": None if out is None else str(out),
         "people": {name: len({person.participant for person in parts[name]}) for name in ("train", "validation")},
         "listening_minutes": round(sum(float(one.listening.sum()) for one in taught) / 25 / 60, 1),
@@ -144,13 +146,13 @@ def _judged(
     taught: Sequence[EventStudent],
     judged: Sequence[EventStudent],
     silent: Sequence[EventStudent],
-) -> dict[str, Any]:
+) -> Figures:
     """Return what a hazard was learned from, and how it ranks the onsets of other people: mean over them, interval.
 
     `silent`: those people without their own voice among the evidence, as a head hears that never speaks.
     """
     lessons = [one.lessons[kind] for one in taught if kind in one.lessons]
-    found: dict[str, Any] = {
+    found: Figures = {
         "onsets": sum(len(one.onsets) for one in lessons),
         "steps": sum(int(one.may.sum()) for one in lessons),
         "per_minute": given.per_minute,
@@ -197,7 +199,7 @@ def _log_odds(given: Hazard, rows: Doubles) -> Doubles:
     return np.concatenate([bank.log_odds(bank.contributions(part))[:, 0] for part in parts])
 
 
-def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) -> dict[str, Any]:
+def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) -> Figures:
     """Return figures of the people's nods, and of nods alone decided in their places at each rate of `KNOBS`."""
 
     def counted(onsets_s: Iterable[Doubles]) -> tuple[dict[str, float], Doubles]:
@@ -216,7 +218,7 @@ def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) ->
     return {key: {name: rounded(value) for name, value in figures.items()} for key, figures in found.items()}
 
 
-def _rows(figures: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _rows(figures: Mapping[str, Any]) -> list[Figures]:
     return [
         {
             "kind": kind.replace("_", " "),
@@ -269,7 +271,7 @@ def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shap
         for seen_s, size in ((laughs_s, sizes.LAUGH), ((sizes.smile_s(rng) for _ in range(DRAWN)), sizes.SMILE))
     )
     slight, whole = sizes.BLINK
-    swings: dict[str, Any] = {"habit": habit, "swings_hz": sizes.SWINGS_HZ}
+    swings: Figures = {"habit": habit, "swings_hz": sizes.SWINGS_HZ}
     return {
         "nod": Shape(duration_s=lasts("nods", 0.2), size=_thousandths(nod_deg), **swings),
         "shake": Shape(duration_s=lasts("shakes", 0.2), size=_thousandths(sizes.SHAKE * nod_deg), **swings),

@@ -147,9 +147,8 @@ def test_without_people_of_validation_nothing_is_ranked(tmp_path):
 def test_one_person_of_validation_is_ranked_without_an_interval(tmp_path):
     write_tables(tmp_path, meetings=("ES2002a", "IS1000a"))
     found = train_events(tmp_path, None, False, 1)
-    nods = found["kinds"]["nod"]
-    assert (nods["people"], nods["interval"]) == (1, [None, None])
-    assert found["rows"][0]["AUC on validation"] == f"{nods['auc']:.3f}"
+    nods, row = found["kinds"]["nod"], found["rows"][0]
+    assert nods["interval"] == [None, None] and row["AUC on validation"] == f"{nods['auc']:.3f}"
 
 
 def test_smiles_last_as_long_as_composed_ones_and_what_is_saved_is_loaded(tmp_path):
