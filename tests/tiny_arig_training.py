@@ -43,7 +43,6 @@ def dyad(name: str, scene: str, seed: int) -> clips.Dyad:
     motion[:, CHANNEL_INDEX["jawOpen"]] = 0.4 * agent
     motion[:, CHANNEL_INDEX["pitch"]] = 0.05 * np.sin(np.arange(frames) / 3) * user
     face = motion[::-1].copy() if scene != "speaking" else np.full((frames, 58), np.nan, np.float32)
-    states = clips.states_of_activity(agent, user)
     return clips.Dyad(
         name=name,
         audio=voice(user),
@@ -51,7 +50,7 @@ def dyad(name: str, scene: str, seed: int) -> clips.Dyad:
         listener=motion,
         listening=user & ~agent,
         agent_audio=voice(agent),
-        states=states,
+        states=clips.states_of_activity(agent, user),
         events=tuple(ListenerEvent("nod", start_s, 0.6, 0.05, 2) for start_s in (2.0, 5.0, 9.0)),
         head_of_gaze_rad=np.zeros((frames, 3), np.float32),
     )

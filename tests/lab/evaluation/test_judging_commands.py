@@ -64,8 +64,7 @@ def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tm
 
 
 def test_windows_in_which_the_listener_talks_himself_are_not_judged(tmp_path):
-    dyads = open_dataset(people(tmp_path, ("validation",), count=1), "validation")
-    one = replace(dyads[0], agent_audio=None)
+    one = replace(open_dataset(people(tmp_path, ("validation",), count=1), "validation")[0], agent_audio=None)
     (every,) = listening([one], [one.listener])
     audio = np.zeros(len(one.listener) * FRAME_SAMPLES, np.float32)
     audio[3 * AUDIO_HZ : 5 * AUDIO_HZ] = np.random.default_rng(0).normal(0, 0.1, 2 * AUDIO_HZ)
