@@ -165,7 +165,7 @@ def usable(dyads: Sequence[Dyad]) -> Iterator[Dyad]:
         log.warning("%d of %d clips cannot be used: %s", len(left_out), len(dyads), named)
 
 
-def guarded(where: str, read: Callable[[], _T]) -> _T:
+def guarded(where: Path | str, read: Callable[[], _T]) -> _T:
     """Return what `read` returns; an error that a broken file causes becomes a ClipError."""
     try:
         return read()
@@ -310,10 +310,7 @@ def existing(file: Path, kind: Kind = "missing half") -> Path:
 
 def npy(file: Path) -> NDArray[Any]:
     """Map an array on disk into memory. Raises ClipError."""
-    try:
-        out: NDArray[Any] = np.load(existing(file), mmap_mode="r", allow_pickle=False)
-    except UNREADABLE as error:
-        raise ClipError("unreadable", file, error) from error
+    out: NDArray[Any] = guarded(file, lambda: np.load(existing(file), mmap_mode="r", allow_pickle=False))
     if not isinstance(out, np.ndarray):
         out.close()  # an archive of several
         raise ClipError("unreadable", file, "no array")

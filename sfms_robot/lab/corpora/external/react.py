@@ -29,13 +29,13 @@ from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import (
     WITH_VAL,
     Clip,
-    ClipError,
     Found,
     Layout,
     attempt,
     dyad_of,
     existing,
     frames_of,
+    guarded,
     npy,
     table,
     track,
@@ -131,10 +131,7 @@ def attributes(folder: Path, clip: str, frames: int) -> Floats:
     files = [folder / EMOTIONS / f"{name}.csv" for name in (clip, cleaned)]
     file = next((file for file in files if file.is_file()), files[0])
     existing(file, "missing feature")
-    try:
-        rows = np.loadtxt(file, delimiter=",", skiprows=1, dtype=np.float32, ndmin=2)
-    except ValueError as error:
-        raise ClipError("unreadable", file, error) from error
+    rows = guarded(file, lambda: np.loadtxt(file, delimiter=",", skiprows=1, dtype=np.float32, ndmin=2))
     return track(str(file), rows, frames, ATTRIBUTES)
 
 

@@ -165,9 +165,9 @@ def _person(name: str, files: Mapping[str, Path]) -> SeamlessPerson:
             raise ClipError("missing sound" if ending == ".wav" else "missing half", missing, "no such file")
     rows, wav = files[".npz"], files[".wav"]
     prefix = _prefix(rows)
-    valid = guarded(str(rows), lambda: _valid(rows, prefix))
+    valid = guarded(rows, lambda: _valid(rows, prefix))
     spans, seconds = _speech(files[".json"]), len(valid) / FPS
-    sound = guarded(str(wav), partial(AudioFile, wav))
+    sound = guarded(wav, partial(AudioFile, wav))
     sound.close()
     sound_s = sound.length / AUDIO_HZ
     if abs(sound_s - seconds) > SLACK_S:
@@ -306,7 +306,7 @@ def _signs(place: Path) -> tuple[bool, str]:
     found = []
     for file in (files[index] for index in spread):
         try:
-            found.append(guarded(str(file), partial(_correlations, file)))
+            found.append(guarded(file, partial(_correlations, file)))
         except ClipError:  # named by the scan
             continue
     found = [one for one in found if one]

@@ -51,10 +51,10 @@ def _splits(listed: Callable[[Path], Mapping[str, str]], place: Path) -> Mapping
 
 def _rows(file: Path, load: Callable[[Path], Any], key: str) -> NDArray[Any]:
     """Return one array of a pickled dict. Raises ClipError."""
-    arrays = guarded(str(existing(file)), lambda: load(file))
+    arrays = guarded(existing(file), lambda: load(file))
     if not isinstance(arrays, dict) or key not in arrays:
         raise ClipError("missing half", file, f"has no {key}")
-    return guarded(str(file), lambda: numbers(arrays, key))
+    return guarded(file, lambda: numbers(arrays, key))
 
 
 def _frames(name: str, space: str, *tracks: tuple[Path, str, NDArray[Any]]) -> int:

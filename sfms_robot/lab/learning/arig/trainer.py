@@ -323,14 +323,8 @@ def augment(dyad: ArigDyad, model: ArigModel, phase: config.ArigPhase, generator
     return told, dyad.agent_motion + torch.where(spoken, 0.0, carried)
 
 
-@lru_cache(maxsize=32)
-def _sent(tensor: Tensor, device: torch.device) -> Tensor:
-    return tensor.to(device)
-
-
-def sent(constant: Tensor, device: torch.device) -> Tensor:
-    """Return a constant that is kept for good on a device; it goes there once."""
-    return constant if constant.device == device else _sent(constant, device)
+# Returns a constant on a device, where it stays for good: it goes there once.
+sent: Final = lru_cache(maxsize=32)(Tensor.to)
 
 
 @lru_cache(maxsize=8)

@@ -271,10 +271,14 @@ def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shap
         for seen_s, size in ((laughs_s, sizes.LAUGH), ((sizes.smile_s(rng) for _ in range(DRAWN)), sizes.SMILE))
     )
     slight, whole = sizes.BLINK
-    swings: Figures = {"habit": habit, "swings_hz": sizes.SWINGS_HZ}
     return {
-        "nod": Shape(duration_s=lasts("nods", 0.2), size=_thousandths(nod_deg), **swings),
-        "shake": Shape(duration_s=lasts("shakes", 0.2), size=_thousandths(sizes.SHAKE * nod_deg), **swings),
+        "nod": Shape(duration_s=lasts("nods", 0.2), size=_thousandths(nod_deg), habit=habit, swings_hz=sizes.SWINGS_HZ),
+        "shake": Shape(
+            duration_s=lasts("shakes", 0.2),
+            size=_thousandths(sizes.SHAKE * nod_deg),
+            habit=habit,
+            swings_hz=sizes.SWINGS_HZ,
+        ),
         "tilt": Shape(duration_s=lasts("tilts", longer_s=12 * FRAME_S), size=sizes.TILT_DEG),
         "laugh": laugh,
         "smile": smile,

@@ -26,7 +26,6 @@ from sfms_robot.listeners.sfms.placement import (
     ScoreNetwork,
     Strategy,
     Tracks,
-    place,
     place_adaptive,
     place_learned,
     tracks,
@@ -358,8 +357,8 @@ def teacher(strategy: Strategy) -> Strategy:
 @torch.no_grad()
 def _masks(tokenizer: Tokenizer, batch: Tensor) -> Tensor:
     """Return the masks (B, T, G) of windows by the teacher's placement."""
-    gap = tokenizer.max_gap if tokenizer.strategy == "exact" else None
-    return place(batch, tokenizer.keyframes, teacher(tokenizer.strategy), member=tokenizer.member, max_gap=gap)
+    unbounded = None if tokenizer.strategy == "exact" else tokenizer.keyframes  # gaps are bounded where it places so
+    return tokenizer.place(batch, unbounded, teacher(tokenizer.strategy))
 
 
 def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn: int) -> Batch:
