@@ -357,8 +357,8 @@ def teacher(strategy: Strategy) -> Strategy:
 @torch.no_grad()
 def _masks(tokenizer: Tokenizer, batch: Tensor) -> Tensor:
     """Return the masks (B, T, G) of windows by the teacher's placement."""
-    unbounded = None if tokenizer.strategy == "exact" else tokenizer.keyframes  # gaps are bounded where it places so
-    return tokenizer.place(batch, unbounded, teacher(tokenizer.strategy))
+    count = None if tokenizer.strategy == "exact" else tokenizer.keyframes  # gaps have no bound where a count is given
+    return tokenizer.place(batch, count, teacher(tokenizer.strategy))
 
 
 def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn: int) -> Batch:
