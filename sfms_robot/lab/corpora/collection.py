@@ -75,7 +75,7 @@ class Clip:
         read: Returns the dyad without features; raises ClipError or what `UNREADABLE` names.
         features: Readers of the other arrays that the layout ships about the frames, (N, F).
         row: Place in the layout's own list, before anything was left out (REACT's appropriateness matrix counts in
-            it). Set by `Layout.dataset`.
+            it). Set by `formats.scan_split`.
     """
 
     name: str
@@ -217,27 +217,6 @@ class Layout:
     def root(self, folder: Path) -> Path | None:
         """Return the folder in or under the given one in which the data lie; None: another layout."""
         return next((place for name in self.below if self.splits(place := folder / name)), None)
-
-    def dataset(self, place: Path, split: str, theirs: str, order: Order | None) -> Dataset:
-        """Scan the split that the files call `theirs`. A file that several clips need is one problem."""
-        found = list(self.scan(place, theirs))
-        listed = enumerate(one for one in found if not isinstance(one, str))
-        facts = {"space": self.space, "fps": self.fps, "licence": self.licence, **self.facts(place, theirs)}
-        dataset = Dataset(
-            layout=self.name,
-            split=split,
-            clips=tuple(replace(one, row=row) for row, one in listed if isinstance(one, Clip)),
-            problems=tuple(dict.fromkeys(one for one in found if isinstance(one, Problem))),
-            notes=tuple(one for one in found if isinstance(one, str)),
-            **facts,
-        )
-        if order != "pose-first":
-            return dataset
-        return dataset.map(  # the six channels of the pose last
-            lambda dyad: replace(
-                dyad, speaker=np.roll(dyad.speaker, -6, axis=1), listener=np.roll(dyad.listener, -6, axis=1)
-            )
-        )
 
 
 # --- Arrays from files of other projects ------------------------------------------------------------------------------

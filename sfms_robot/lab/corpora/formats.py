@@ -21,7 +21,18 @@ from sfms_robot.config.base import read as read_yaml
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats
 from sfms_robot.lab.corpora.clips import FEATURE, SPLITS, read
-from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Found, Layout, Order, attempt, npz, npz_shapes
+from sfms_robot.lab.corpora.collection import (
+    Clip,
+    ClipError,
+    Dataset,
+    Found,
+    Layout,
+    Order,
+    Problem,
+    attempt,
+    npz,
+    npz_shapes,
+)
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, in_arkit
 from sfms_robot.lab.corpora.external import dualtalk, l2l, react, seamless, vico
 
@@ -200,10 +211,27 @@ def scan_split(layout: Layout, place: Path, split: str, order: Order | None = No
     theirs = layout.splits(place)
     if split not in split_names(layout, place):
         raise ConfigError(f"{place}: has no split {split} ({', '.join(split_names(layout, place)) or 'none'})")
-    held_out = "validation" not in theirs and layout.held_out
+    name = theirs.get(split, theirs.get("train", ""))
     with bar(f"{split}: headers"):  # of many files even these take some time
-        whole = layout.dataset(place, split, theirs.get(split, theirs.get("train", "")), order or layout.order)
-    if not held_out or split not in ("train", "validation"):
+        found = list(layout.scan(place, name))
+        facts = {"space": layout.space, "fps": layout.fps, "licence": layout.licence, **layout.facts(place, name)}
+    listed = enumerate(one for one in found if not isinstance(one, str))
+    whole = Dataset(
+        layout=layout.name,
+        split=split,
+        clips=tuple(replace(one, row=row) for row, one in listed if isinstance(one, Clip)),
+        # A file that several clips need is one problem.
+        problems=tuple(dict.fromkeys(one for one in found if isinstance(one, Problem))),
+        notes=tuple(one for one in found if isinstance(one, str)),
+        **facts,
+    )
+    if (order or layout.order) == "pose-first":  # the six channels of the pose come last in ours
+        whole = whole.map(
+            lambda dyad: replace(
+                dyad, speaker=np.roll(dyad.speaker, -6, axis=1), listener=np.roll(dyad.listener, -6, axis=1)
+            )
+        )
+    if "validation" in theirs or not layout.held_out or split not in ("train", "validation"):
         return whole
     rank = np.random.default_rng(_SEED).permutation(len(whole))
     first = rank < max(round(layout.held_out * len(whole)), min(1, len(whole) - 1))
