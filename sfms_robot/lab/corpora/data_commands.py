@@ -200,7 +200,13 @@ def convert_data(
     found, place = formats.detect(folder, layout)
     if found.space not in CONVERTIBLE:
         raise ConfigError(f"{place}: {found.name} is in {found.space}, which cannot become arkit58")
-    flame = _matrix(found.space, flame_matrix, flame_order)
+    flame = None
+    if flame_matrix is not None:
+        if found.space != "deca56":
+            raise ConfigError(f"--flame-matrix {flame_matrix}: {found.space} has no FLAME expression (deca56 has)")
+        if not flame_matrix.is_file():
+            raise ConfigError(f"--flame-matrix {flame_matrix}: no such file")
+        flame = read_matrix(flame_matrix, flame_order)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file, not a folder to write dyads to")
     if out.is_dir() and any(out.iterdir()):
@@ -227,16 +233,6 @@ def convert_data(
         "residual_names": FIGURES,
         "notes": list(residual.notes),
     }
-
-
-def _matrix(space: str, file: Path | None, order: str) -> FlameMatrix | None:
-    if file is None:
-        return None
-    if space != "deca56":
-        raise ConfigError(f"--flame-matrix {file}: {space} has no FLAME expression (deca56 has)")
-    if not file.is_file():
-        raise ConfigError(f"--flame-matrix {file}: no such file")
-    return read_matrix(file, order)
 
 
 def _converted(

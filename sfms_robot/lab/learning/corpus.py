@@ -248,7 +248,17 @@ def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tens
     Deviations are clipped to a visible range: a still channel's noise is not amplified,
     and small movements of a channel that also makes large ones (a turning head) still count.
     """
-    least, most = _spread_bounds(channels)
+    bounds = []  # of blendshapes, rotations [rad], places [m]
+    for name in channels:
+        if name in BLENDSHAPES:
+            bounds.append((0.04, 0.12))
+        elif name in ("roll", "pitch", "yaw") or name.startswith(("rotation", "head", "jaw_")):
+            bounds.append((0.01, 0.03))
+        elif name.startswith("expression"):  # FLAME's components, in units of their own deviation
+            bounds.append((0.1, 1e6))
+        else:
+            bounds.append((0.01, 0.01))
+    least, most = torch.tensor(bounds).T
     return motion.mean(0), motion.std(0).clamp(min=least, max=most)
 
 
@@ -269,22 +279,6 @@ def fit_sound(model: SfmsModel | ArigModel, *tracks: tuple[Tensor, Tensor]) -> N
     spread = rows.std(0)
     model.sound_mean.copy_(rows.mean(0))
     model.sound_std.copy_(spread.clamp(min=max(LEAST_SOUND_SPREAD, 0.2 * float(spread.median()))))
-
-
-def _spread_bounds(channels: Sequence[str]) -> tuple[Tensor, Tensor]:
-    """Return the least and largest deviations (C,) to divide by: of blendshapes, rotations [rad], places [m]."""
-    bounds = []
-    for name in channels:
-        if name in BLENDSHAPES:
-            bounds.append((0.04, 0.12))
-        elif name in ("roll", "pitch", "yaw") or name.startswith(("rotation", "head", "jaw_")):
-            bounds.append((0.01, 0.03))
-        elif name.startswith("expression"):  # FLAME's components, in units of their own deviation
-            bounds.append((0.1, 1e6))
-        else:
-            bounds.append((0.01, 0.01))
-    least, most = torch.tensor(bounds).T
-    return least, most
 
 
 # --- Frames on disk --------------------------------------------------------------------------------------------------
