@@ -264,7 +264,7 @@ def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shap
     laugh, smile = (
         Shape(
             duration_s=_quantiles(
-                np.array([len(held(pick(motions.smiles, rng), int(seen * FRAME_HZ))) for seen in seen_s]) * FRAME_S
+                _recorded([held(pick(motions.smiles, rng), int(seen * FRAME_HZ)) for seen in seen_s])
             ),
             size=size,
         )
