@@ -40,7 +40,8 @@ Kind = Literal[
     "unreadable", "swapped order", "time stamps",
 ]  # fmt: skip
 
-WITH_VAL: Final = {"train": "train", "validation": "val", "test": "test"}  # our names of splits, and those of some
+OUR_NAMES: Final = {"val": "validation", "valid": "validation", "dev": "validation"}  # of splits, by other names
+WITH_VAL: Final = {"train": "train", "validation": "val", "test": "test"}  # REACT, lm-listener
 _NAMED: Final = 5  # problems a warning names
 
 log = logging.getLogger(__name__)

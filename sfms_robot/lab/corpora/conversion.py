@@ -161,8 +161,6 @@ def _apart_rad(filed: Doubles, ours: Floats, space: str) -> Doubles:
 
 # --- Dyads of other frame rates at 25 fps: what a listener that is streamed through them asks for -----------------
 
-SPACE: Final = "arkit58"  # in other spaces a frame between two is not always what lies between their numbers
-
 
 def at_frame_rate(dyad: Dyad) -> Dyad:
     """Return the dyad at 25 fps, cut to whole frames: motion linear in time, other rows the newest known.
@@ -171,7 +169,7 @@ def at_frame_rate(dyad: Dyad) -> Dyad:
     """
     if dyad.fps == FRAME_HZ:
         return dyad
-    if dyad.space != SPACE:
+    if dyad.space != "arkit58":  # in others what lies between two frames is not between their numbers
         raise ConfigError(f"{dyad.name}: {dyad.fps:g} fps in {dyad.space}, a listener is streamed at {FRAME_HZ}")
     frames = int(len(dyad.listener) * FRAME_HZ / dyad.fps + 1e-6)
     if not frames:

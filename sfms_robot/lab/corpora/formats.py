@@ -22,6 +22,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats
 from sfms_robot.lab.corpora.clips import FEATURE, SPLITS, read
 from sfms_robot.lab.corpora.collection import (
+    OUR_NAMES,
     Clip,
     ClipError,
     Dataset,
@@ -117,7 +118,6 @@ LAYOUTS: Final = {
         dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT, vico.DIM, vico.VICO, seamless.LAYOUT, COMPOSED,
     )
 }  # fmt: skip
-_SPLITS: Final = {"val": "validation", "valid": "validation", "dev": "validation"}
 _SAMPLE: Final = 8  # clips looked at for the order of their channels
 _SEED: Final = 0
 
@@ -169,7 +169,7 @@ def open_dataset(
     What cannot be used is in `problems` and counted in a warning. Raises ConfigError when nothing is left.
     """
     found, place = detect(folder, layout)
-    dataset = scan_split(found, place, _SPLITS.get(split, split), order)
+    dataset = scan_split(found, place, OUR_NAMES.get(split, split), order)
     if not dataset.clips:
         why = f": {dataset.problems[0]}" if dataset.problems else ""
         raise ConfigError(f"{place}: no usable clip in {split} ({len(dataset.problems)} problems){why}")

@@ -22,6 +22,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Floats
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
 from sfms_robot.lab.corpora.collection import (
+    OUR_NAMES,
     Clip,
     ClipError,
     Found,
@@ -41,12 +42,11 @@ from sfms_robot.lab.corpora.collection import (
 
 FPS: Final = 30.0
 LIST: Final = "RLD_data.csv"
-SPLIT_NAMES: Final = {"train": "train", "valid": "validation", "val": "validation", "test": "test", "ood": "ood"}
 ROLES: Final = ("speaker", "listener")
 
 
 def _splits(listed: Callable[[Path], Mapping[str, str]], place: Path) -> Mapping[str, str]:
-    return {SPLIT_NAMES.get(theirs, theirs): theirs for theirs in sorted(set(listed(place).values()))}
+    return {OUR_NAMES.get(theirs, theirs): theirs for theirs in sorted(set(listed(place).values()))}
 
 
 def _rows(file: Path, load: Callable[[Path], Any], key: str) -> NDArray[Any]:
