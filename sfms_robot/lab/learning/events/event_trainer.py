@@ -68,7 +68,6 @@ FLOOR: Final[Groups] = {
     "holder_silence_s": _SILENCE,
 }
 OWN_VOICE: Final[Groups] = {"own_voice_s": _LONG, "own_voice_known": ()}
-OWN_NODS: Final[Groups] = {"nod_end_s": _LONG, "root_nods_30s": (), "log_rate": ()}
 GAZE: Final[Groups] = {
     "gaze_known": (),
     "looked_at": (),
@@ -76,7 +75,16 @@ GAZE: Final[Groups] = {
     "looked_at_silence_s": (0.0, 0.24, 0.6, 1.3, 4.0),
 }
 OTHERS: Final[Groups] = {"laugh_s": _LAUGH, "others_nod_s": (0.0, 0.4, 0.8, 1.5, 3.0, 6.0, 12.0)}
-STUDY: Final[Groups] = {**PHASE, **FLOOR, "own_voice_s": _LONG, **OWN_NODS, **GAZE, **OTHERS}  # 89 inputs
+STUDY: Final[Groups] = {  # 89 inputs
+    **PHASE,
+    **FLOOR,
+    "own_voice_s": _LONG,
+    "nod_end_s": _LONG,
+    "root_nods_30s": (),
+    "log_rate": (),
+    **GAZE,
+    **OTHERS,
+}
 STUDY_RIDGE, RIDGE = 10.0, 3.0  # the second, and what is added below, did better on validation
 THEIR_SMILE: Final[Groups] = {"others_smile_s": (0.0, 0.06, 0.12, 0.24, 0.4, 0.8, 1.6, 3.2)}
 GROUPS: Final[Mapping[str, Groups]] = {
