@@ -174,11 +174,11 @@ def train_settings(options: TrainOptions, phase: str = "training") -> AnyTrainin
 
 
 @contextmanager
-def run_of(options: TrainOptions, job: str, *made: str) -> Iterator[Run]:
+def run_of(options: TrainOptions, job: str, weights: str, *others: str) -> Iterator[Run]:
     """Yield the run of a job with the settings of the command line, and a progress bar.
 
-    What torchrun has started again resumes from its checkpoint. Raises ConfigError where this run would replace its
-    checkpoint, or the files `made` by an earlier training.
+    What torchrun has started again resumes from its checkpoint. Raises ConfigError where files of an earlier training
+    of this job, or of `others`, would be replaced.
     """
     device, kept = device_of(options.device), checkpoint_file(options.out, job)
     with ExitStack() as stack:
@@ -193,7 +193,7 @@ def run_of(options: TrainOptions, job: str, *made: str) -> Iterator[Run]:
             watches.append(stack.enter_context(progress_bar()))
         if not (group.restarts or options.resume or options.overwrite):
             group.wait()  # nothing has been written yet by any of them
-            for file in (*(options.out / name for name in made), kept):
+            for file in (options.out / weights, kept, *(options.out / name for name in others)):
                 if file.exists():
                     raise ConfigError(
                         f"{file} is of an earlier training: --resume continues it, --overwrite starts again"
