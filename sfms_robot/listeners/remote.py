@@ -88,7 +88,6 @@ class RemoteListener:
         self._waiting_since_s: float | None = None  # for an answer to a frame
         self._skipped = self._unsent = self._refused_messages = 0
         self._joins = self._losses = 0
-        self._looped = False
 
     # --- before the loop ---------------------------------------------------------------------------------------------
 
@@ -98,8 +97,8 @@ class RemoteListener:
         Raises ConfigError where the server refuses for good, or the link can never be opened.
         """
         end_s = time.monotonic() + limit_s
-        while self._welcome is None and time.monotonic() < end_s:
-            self._attend(time.monotonic())
+        while self._welcome is None and (now_s := time.monotonic() - end_s) < 0:  # before loop time, which begins at 0
+            self._attend(now_s)
             if self._refusal is not None and self._refusal.final:
                 raise ConfigError(f"{PREFIX}{self._name}: {self._refusal.reason}")
             if self._link.problem is not None:
@@ -113,7 +112,6 @@ class RemoteListener:
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
         """Send a frame. Never blocks."""
-        self._begin_loop(now_s)
         if self._welcome is None:
             self._unsent += 1
             return
@@ -126,7 +124,6 @@ class RemoteListener:
 
     def poll(self, now_s: float) -> Sequence[Plan]:
         """Return plans whose turn it is. Never blocks, never raises."""
-        self._begin_loop(now_s)
         self._attend(now_s)
         self._supervise(now_s)
         return [self._with_new_events(plan) for plan in self._buffer.take(now_s)]
@@ -180,11 +177,6 @@ class RemoteListener:
         self._link.close()
 
     # --- messages --------------------------------------------------------------------------------------------------
-
-    def _begin_loop(self, now_s: float) -> None:
-        """Forget times of before the loop: they are of another clock."""
-        if not self._looped:
-            self._looped, self._asked_s = True, -math.inf
 
     def _attend(self, now_s: float) -> None:
         """Handle what came, and request a stream where that is due."""

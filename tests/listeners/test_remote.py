@@ -111,6 +111,14 @@ def test_a_refusal_for_good_or_another_version_ends_the_start_with_both_sides_na
     assert "arkit58" in figures(head)["why"] and "deca56" in figures(head)["why"]
 
 
+def test_plans_wait_for_late_ones_also_of_a_stream_that_was_joined_before_the_loop():
+    head = robot(Network(0.05, 0.02), horizon=1, hop=1)
+    head.link.ask = lambda message: head.link.arrived(head.server.core.join(message, head.server.now_s()))
+    head.feed.wait_loaded(1.0)
+    assert not head.feed.lost
+    assert figures(head.run(4.0))["link"]["buffer_ms"] > 60
+
+
 def asking(head):
     asked = []
     head.link.ask, ask = asked.append, head.link.ask
