@@ -82,8 +82,9 @@ class LoopState:
 
     Attributes:
         held_rad, since_s: (J,) the pose in which torque came on, and its time.
-        before_rad, here_rad: (J,) two samples of the reference.
-        goals_rad: (J,) the last command; `motion` (58,) the face behind it.
+        before_rad, here_rad: (J,) two samples of the reference: of the last command, and of the next.
+        goals_rad: (J,) the last command; `motion` (58,) the face behind it, `reach_s` the latest instant of the
+            timeline that it used.
         run: the state of the run, judged by `presence` and `lost_joints`.
         answer: share of the listener's answer that shows.
         released: (J,) joints that a halt has let go of and that have not come back; their goals stand still.
@@ -97,6 +98,7 @@ class LoopState:
     before_rad: Doubles
     here_rad: Doubles
     goals_rad: Doubles
+    reach_s: float = -math.inf
     retargeter: Any
     heat: Heat
     released: Bools
@@ -139,24 +141,25 @@ def drive(
                 state = _heard(parts, observers, log, tick.time_s, state)
                 state = _judged(parts, log, tick.time_s, state)
                 if state.run.name == "halted":
-                    state, command = _halted(parts, tick.time_s, state)
+                    state = _halted(parts, tick.time_s, state)
                 else:
                     if state.stands:
                         state = _resumed(parts, log, tick.time_s, state)
-                    state, command = _commanded(parts, tick.time_s, 1.0 / rate_hz, state)
-                log.commanded(tick, command.goals_rad, command.asked_rad, command.motion)
-                parts.bus.write(command.goals_rad, tick.time_s)
+                    state = _commanded(parts, tick.time_s, 1.0 / rate_hz, state)
+                goals_rad, motion = state.goals_rad, state.motion
+                log.commanded(tick, goals_rad, state.before_rad, motion)
+                parts.bus.write(goals_rad, tick.time_s)
                 written_s = clock.now_s() - start_s
-                log.wrote(written_s, command.reach_s)
+                log.wrote(written_s, state.reach_s)
                 readings = parts.bus.poll(tick.time_s)
                 state = _rejoined(parts, log, readings, state, tick.time_s)
                 state = _noticed(parts, readings, state, tick.time_s, 1.0 / rate_hz)
-                parts.source.moves(float(np.abs(command.goals_rad - before_rad).sum() * rate_hz))
+                parts.source.moves(float(np.abs(goals_rad - before_rad).sum() * rate_hz))
                 observers.tick(
                     Tick(
                         time_s=tick.time_s,
-                        motion=command.motion,
-                        goals_rad=command.goals_rad,
+                        motion=motion,
+                        goals_rad=goals_rad,
                         readings=readings,
                         state=state.run.name,
                         why=state.run.why,
@@ -271,21 +274,8 @@ def turned_by_hand(planned: Floats, asked: Floats) -> bool:
     return asked is not planned and not np.array_equal(asked[:, _TURNING], planned[:, _TURNING])
 
 
-@dataclass(frozen=True)
-class TickCommand:
-    """Command of a tick: goals (J,), the limiter's reference (J,), the face (58,) behind it.
-
-    `reach_s`: latest instant of the timeline that it used.
-    """
-
-    goals_rad: Doubles
-    asked_rad: Doubles
-    motion: Floats
-    reach_s: float
-
-
-def _commanded(parts: Parts, now_s: float, period_s: float, state: LoopState) -> tuple[LoopState, TickCommand]:
-    """Return the goals inside the limits for the face of this instant, each joint ahead by its lead."""
+def _commanded(parts: Parts, now_s: float, period_s: float, state: LoopState) -> LoopState:
+    """Return the state with goals inside the limits for the face of this instant, each joint ahead by its lead."""
     ahead_s = np.minimum(parts.leads_s + period_s, parts.timeline.lead_limit_s(state.timeline))
     times_s = np.concatenate([[now_s], now_s + ahead_s])
     motion, timeline = parts.timeline.sample(times_s, now_s, state.timeline)
@@ -310,14 +300,13 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: LoopState) ->
     ahead_rad = state.held_rad + eased * (angles_rad - state.held_rad)
     reference = difference(state.before_rad, state.here_rad, ahead_rad, period_s)
     goals_rad, limiter = parts.limiter.step(reference, state.limiter)
-    state = replace(
+    return replace(
         state, timeline=timeline, limiter=limiter, before_rad=state.here_rad, here_rad=ahead_rad, goals_rad=goals_rad,
-        life=life, retargeter=retargeter, answer=answer, motion=motion[0],
+        reach_s=float(times_s.max()), life=life, retargeter=retargeter, answer=answer, motion=motion[0],
     )  # fmt: skip
-    return state, TickCommand(goals_rad, reference[0], motion[0], float(times_s.max()))
 
 
-def _halted(parts: Parts, now_s: float, state: LoopState) -> tuple[LoopState, TickCommand]:
+def _halted(parts: Parts, now_s: float, state: LoopState) -> LoopState:
     """Brake; once all joints stand, release those that need not hold."""
     goals_rad, limiter = parts.limiter.brake(state.limiter)
     released, stands = state.released, state.stands
@@ -326,8 +315,10 @@ def _halted(parts: Parts, now_s: float, state: LoopState) -> tuple[LoopState, Ti
     if not stands and np.array_equal(goals_rad, state.goals_rad):
         stands, released = True, np.ones_like(released) if parts.holds is None else released | ~parts.holds
         _let_go(parts, released)
-    command = TickCommand(goals_rad, goals_rad, np.zeros(MOTION_DIM, np.float32), -math.inf)
-    return replace(state, limiter=limiter, goals_rad=goals_rad, released=released, stands=stands), command
+    return replace(
+        state, limiter=limiter, before_rad=goals_rad, here_rad=goals_rad, goals_rad=goals_rad, reach_s=-math.inf,
+        released=released, stands=stands, motion=np.zeros(MOTION_DIM, np.float32),
+    )  # fmt: skip
 
 
 def _let_go(parts: Parts, which: Bools) -> None:
