@@ -24,19 +24,18 @@ import queue
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 import orjson
 from mcap.writer import Writer
-from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.signals.audio import energy_db
@@ -192,7 +191,10 @@ class Recorder(Observer):
         self._parts += 1
         self._in_part = 0
         with _naming(self._folder), ExitStack() as stack:
-            self._file = _open(self._folder, part_name(self._parts))
+            self._folder.mkdir(parents=True, exist_ok=True)
+            for old in parts_of(self._folder) if self._parts == 1 else ():  # of a recording that may be replaced
+                old.unlink()
+            self._file = (self._folder / part_name(self._parts)).open("wb")
             stack.callback(self._file.close)
             self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES)
             self._writer.start(profile="" if self._format == "json" else "ros2", library="sfms-robot")
@@ -224,8 +226,8 @@ class Recorder(Observer):
             _log.error("the recording ends here: %s", self._trouble)
 
     def _write(self, value: Tick | SpeakerFrame | Plan | None) -> None:
-        """Write the messages of a value; None: the last events."""
-        for topic, time_s, body in self._news(math.inf) if value is None else self._messages(value):
+        """Write the messages of a value."""
+        for topic, time_s, body in self._messages(value):
             time_ns = max(0, round(time_s * 1e9))
             text = orjson.dumps(body)
             for name, data in [(topic, text)] if self._format == "json" else _as_ros2(topic, time_s, body, text):
@@ -236,32 +238,65 @@ class Recorder(Observer):
             self._end()
             self._begin()
 
-    def _messages(self, value: Tick | SpeakerFrame | Plan) -> list[Message]:
-        """Return the messages of one value: topic, time, body."""
-        if isinstance(value, SpeakerFrame):
-            return [("/speaker", value.time_s, _speaker_body(value))]
-        if isinstance(value, Plan):
-            self._events.join(value)
-            return [("/plan", value.made_at_s, _plan_body(value)), *self._news(value.made_at_s)]
-        messages: list[Message] = [
-            ("/face", value.time_s, {"time_s": value.time_s, **_by_channel(value.motion)}),
-            ("/joints", value.time_s, _joints_body(value, self._joints)),
-        ]
-        if (value.state, value.why) != self._state:
-            self._state = (value.state, value.why)
-            state = {"time_s": value.time_s, "state": value.state, "why": list(value.why)}
-            messages.append(("/state", value.time_s, state))
-        if value.time_s - self._servos_s >= SERVOS_S:
-            self._servos_s = value.time_s
-            messages.append(("/servos", value.time_s, _servos_body(value)))
-        return messages
+    def _messages(self, value: Tick | SpeakerFrame | Plan | None) -> Iterator[Message]:
+        """Yield the messages of a value: topic, time, body; of None the last events."""
+        match value:
+            case None:
+                yield from self._news(math.inf)
+            case SpeakerFrame(face=face):
+                body: dict[str, Any] = {
+                    "time_s": value.time_s,
+                    "audio_pcm16": _pcm16(value.audio),
+                    "agent_audio_pcm16": None if value.agent_audio is None else _pcm16(value.agent_audio),
+                    "audio_hz": AUDIO_HZ,
+                    "energy_db": round(energy_db(value.audio), 2),
+                    "face": face and _by_channel(face.motion),
+                    "jaw_rad": face and _rounded(face.jaw_rad),
+                    "attention": _rounded(value.attention),
+                    "place_m": _rounded(value.place_m),
+                }
+                yield "/speaker", value.time_s, body
+            case Plan():
+                self._events.join(value)
+                body = {
+                    "made_at_s": value.made_at_s,
+                    "times_s": _rounded(value.times_s),
+                    "frames": _rounded(value.frames),
+                    "jaw_rad": _rounded(value.jaw_rad),
+                    "hazards_hz": {kind: _rounded(hazard) for kind, hazard in value.hazards_hz.items()},
+                }
+                yield "/plan", value.made_at_s, body
+                yield from self._news(value.made_at_s)
+            case Tick(time_s=time_s, readings=readings):
+                yield "/face", time_s, {"time_s": time_s, **_by_channel(value.motion)}
+                joints = {
+                    name: {
+                        "goal_rad": goal_rad,
+                        "present_rad": reading and _rounded(reading.position_rad),
+                        "age_s": reading and _rounded(reading.age_s),
+                        "fault": reading and reading.fault,
+                    }
+                    for name, goal_rad in zip(self._joints, _rounded(value.goals_rad), strict=True)
+                    for reading in [readings.get(name)]
+                }
+                yield "/joints", time_s, {"time_s": time_s, "joints": joints}
+                if (value.state, value.why) != self._state:
+                    self._state = value.state, value.why
+                    yield "/state", time_s, {"time_s": time_s, "state": value.state, "why": list(value.why)}
+                if time_s - self._servos_s >= SERVOS_S:
+                    self._servos_s = time_s
+                    servos = {
+                        joint: {name: _rounded(each) for name, each in reading.extra.items()} | {"fault": reading.fault}
+                        for joint, reading in readings.items()
+                    }
+                    yield "/servos", time_s, {"time_s": time_s, "servos": servos}
 
-    def _news(self, now_s: float) -> list[Message]:
-        """Return the events of plans, once a second: a search takes a millisecond that may delay the loop's thread."""
-        if 0 <= now_s - self._searched_s < EVENTS_S:
-            return []
-        self._searched_s = now_s
-        return [("/event", event.start_s, _event_body(event)) for event in self._events.news()]
+    def _news(self, now_s: float) -> Iterator[Message]:
+        """Yield the events of plans, once a second: a search takes a millisecond that may delay the loop's thread."""
+        if not 0 <= now_s - self._searched_s < EVENTS_S:
+            self._searched_s = now_s
+            for event in self._events.news():
+                yield "/event", event.start_s, {name: each for name, each in vars(event).items() if name != "origin_s"}
 
 
 def _json_channels(writer: Writer) -> dict[str, int]:
@@ -311,10 +346,6 @@ def _as_ros2(topic: str, time_s: float, body: Mapping[str, Any], text: bytes) ->
             yield "/diagnostics", ros2.to_cdr(ros2.DIAGNOSTICS, state)
 
 
-def _event_body(event: ListenerEvent) -> dict[str, Any]:
-    return {key: value for key, value in asdict(event).items() if key != "origin_s"}
-
-
 def check_folder(folder: Path, overwrite: bool = False) -> None:
     """Raise ConfigError where a run cannot be recorded, or one is already that may not be overwritten."""
     with _naming(folder):
@@ -356,75 +387,21 @@ def _naming(folder: Path) -> Iterator[None]:
         raise ConfigError(f"--record {folder}: {error.strerror or error}") from error
 
 
-def _open(folder: Path, name: str) -> BinaryIO:
-    folder.mkdir(parents=True, exist_ok=True)
-    if name == RUN_FILE:
-        for old in parts_of(folder):  # of a recording that may be replaced, see `check_folder`
-            old.unlink()
-    return (folder / name).open("wb")
-
-
-def _plan_body(plan: Plan) -> dict[str, Any]:
-    return {
-        "made_at_s": plan.made_at_s,
-        "times_s": _numbers(plan.times_s),
-        "frames": _numbers(plan.frames),
-        "jaw_rad": None if plan.jaw_rad is None else _numbers(plan.jaw_rad),
-        "hazards_hz": {kind: _number(hazard) for kind, hazard in plan.hazards_hz.items()},
-    }
-
-
-def _speaker_body(frame: SpeakerFrame) -> dict[str, Any]:
-    jaw_rad = None if frame.face is None else frame.face.jaw_rad
-    return {
-        "time_s": frame.time_s,
-        "audio_pcm16": _pcm16(frame.audio),
-        "agent_audio_pcm16": None if frame.agent_audio is None else _pcm16(frame.agent_audio),
-        "audio_hz": AUDIO_HZ,
-        "energy_db": round(energy_db(frame.audio), 2),
-        "face": None if frame.face is None else _by_channel(frame.face.motion),
-        "jaw_rad": None if jaw_rad is None else _numbers(jaw_rad),
-        "attention": None if frame.attention is None else _number(frame.attention),
-        "place_m": None if frame.place_m is None else _numbers(frame.place_m),
-    }
-
-
 def _pcm16(audio: Floats) -> str:
     """Return samples of -1..1 as 16-bit integers, little-endian, in base64."""
     pcm = np.round(np.clip(audio, -1.0, 1.0) * 32767).astype("<i2")
     return base64.b64encode(pcm.tobytes()).decode()
 
 
-def _joints_body(seen: Tick, joints: Sequence[str]) -> dict[str, Any]:
-    body = {}
-    for name, goal_rad in zip(joints, _numbers(seen.goals_rad), strict=True):
-        reading = seen.readings.get(name)
-        body[name] = {
-            "goal_rad": goal_rad,
-            "present_rad": None if reading is None or reading.position_rad is None else _number(reading.position_rad),
-            "age_s": None if reading is None else _number(reading.age_s),
-            "fault": None if reading is None else reading.fault,
-        }
-    return {"time_s": seen.time_s, "joints": body}
-
-
-def _servos_body(seen: Tick) -> dict[str, Any]:
-    servos = {
-        joint: {**{name: _number(value) for name, value in reading.extra.items()}, "fault": reading.fault}
-        for joint, reading in seen.readings.items()
-    }
-    return {"time_s": seen.time_s, "servos": servos}
-
-
 def _by_channel(motion: Floats) -> dict[str, float]:
-    return dict(zip(CHANNELS, _numbers(motion), strict=True))
+    return dict(zip(CHANNELS, _rounded(motion), strict=True))
 
 
-def _number(value: float) -> float:
-    """Round a number. Values that are not finite become null on disk: JSON has no inf and no NaN."""
-    return round(float(value), _DIGITS)
+def _rounded(value: Any) -> Any:
+    """Return a number rounded, an array as rounded lists, None as it is.
 
-
-def _numbers(values: NDArray[np.floating]) -> list[Any]:
-    rounded: list[Any] = values.astype(np.float64).round(_DIGITS).tolist()
-    return rounded
+    Values that are not finite become null on disk: JSON has no inf and no NaN.
+    """
+    if isinstance(value, np.ndarray):
+        return value.astype(np.float64).round(_DIGITS).tolist()
+    return None if value is None else round(float(value), _DIGITS)
