@@ -41,6 +41,11 @@ def places_of(x: Tensor) -> Tensor:
 # --- What both models are made of -------------------------------------------------------------------------------------
 
 
+def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
+    """Return two linear layers with a GELU between."""
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, outputs))
+
+
 class ListenerModel(nn.Module):
     """Weights of one listener. Base of both: scales of motion and sound, and the sway, which training sets."""
 

@@ -39,7 +39,7 @@ from sfms_robot.listeners.arig.modules import LongRange, Merge, Progressive, Sho
 from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser
 from sfms_robot.listeners.arig.stream import CONTROL_ROWS, FIRST
 from sfms_robot.listeners.audio_frontend import WIDTHS
-from sfms_robot.listeners.layers import ListenerModel, weighted_mean, windows
+from sfms_robot.listeners.layers import ListenerModel, mlp, weighted_mean, windows
 from sfms_robot.signals import phase
 from sfms_robot.signals.control import COLUMNS
 
@@ -131,7 +131,7 @@ class ArigModel(ListenerModel):
         self.channels, self.sound_width = len(settings.channels), WIDTHS[settings.sound]
         self._register_scales()
         self.sounds_read = self.sound_width - (0 if settings.phase else phase.FEATURES)  # the place in a phrase is last
-        self.sound_in = _mlp(self.sounds_read, d, d)
+        self.sound_in = mlp(self.sounds_read, d, d)
         self.motion_in = nn.Linear(self.channels, d)
         self.no_user_sound = nn.Parameter(torch.randn(d) * 0.02)
         self.no_agent_sound = nn.Parameter(torch.randn(d) * 0.02)
@@ -142,14 +142,14 @@ class ArigModel(ListenerModel):
         self.long = LongRange(settings)
         self.states = StateUnderstanding(settings) if settings.state_guidance else None
         self.progress = Progressive(settings)
-        self.events_in = _mlp(CONTROL_ROWS * len(COLUMNS), d, d) if events else None
+        self.events_in = mlp(CONTROL_ROWS * len(COLUMNS), d, d) if events else None
         condition = d + d * events + self.channels * innovation
         self.head: Denoiser | CodeHead = (
             CodeHead(self.channels, d, condition, settings.code_levels)
             if settings.discrete
             else Denoiser(settings.channels, condition, settings.diffusion)
         )
-        self.mean = _mlp(condition, MEAN_WIDTH, self.channels) if innovation else None
+        self.mean = mlp(condition, MEAN_WIDTH, self.channels) if innovation else None
 
     def _register_scales(self) -> None:
         """Register the buffers that training sets from its data, and which channels are drawn and recalled."""
@@ -351,7 +351,3 @@ class ArigModel(ListenerModel):
             return features.flatten(0, 1), logits
         feature, scores = self.states(keys, states[:, :-1].reshape(b * t))
         return feature, scores.view(b, t, -1)
-
-
-def _mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
-    return nn.Sequential(nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, outputs))

@@ -28,6 +28,7 @@ from sfms_robot.listeners.layers import (
     Modulation,
     attention,
     join_heads,
+    mlp,
     modulated,
     split_heads,
 )
@@ -41,7 +42,7 @@ class Merge(nn.Module):
     def __init__(self, width: int, visual: bool) -> None:
         super().__init__()
         self.visual = visual
-        self.mlp = nn.Sequential(nn.Linear((1 + visual) * width, width), nn.GELU(), nn.Linear(width, width))
+        self.mlp = mlp((1 + visual) * width, width, width)
 
     def forward(self, sound: Tensor, motion: Tensor) -> Tensor:
         """Return (..., D) of (..., D) and (..., D)."""

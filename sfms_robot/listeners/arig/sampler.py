@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.listeners.layers import Modulation, modulated, sinusoidal, weighted_mean
-from sfms_robot.listeners.sfms.quantizer import as_levels, codes_to_indices, indices_to_codes, quantize
+from sfms_robot.listeners.layers import Modulation, mlp, modulated, sinusoidal, weighted_mean
+from sfms_robot.listeners.sfms.quantizer import Grid
 
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
 BEYOND_ALL = 1e4  # deviations: an estimate that is not clamped is clamped to this, which 16 bits hold
@@ -193,9 +193,9 @@ class CodeHead(nn.Module):
 
     def __init__(self, channels: int, width: int, condition: int, levels: tuple[int, ...]) -> None:
         super().__init__()
-        self.levels = nn.Buffer(as_levels([levels]), persistent=False)
-        self.encode = nn.Sequential(nn.Linear(channels, width), nn.GELU(), nn.Linear(width, len(levels)))
-        self.decode = nn.Sequential(nn.Linear(len(levels), width), nn.GELU(), nn.Linear(width, channels))
+        self.grid = Grid([levels])
+        self.encode = mlp(channels, width, len(levels))
+        self.decode = mlp(len(levels), width, channels)
         self.classify = nn.Linear(condition, math.prod(levels))
 
     def loss(
@@ -203,9 +203,9 @@ class CodeHead(nn.Module):
     ) -> Tensor:
         """Return cross-entropy of the code plus squared error of the code, (N,); arguments as `Denoiser.loss`."""
         # B.1: the softmax learns which code; encoder and decoder learn from what the code makes of the motion.
-        code = quantize(self.encode(motion)[:, None], self.levels)  # (N, 1, dims)
+        code = self.grid.nearest(self.encode(motion)[:, None])  # (N, 1, dims)
         rebuilt = weighted_mean((self.decode(code[:, 0]) - motion).square(), weights)
-        index = codes_to_indices(code.detach(), self.levels)[:, 0]
+        index = self.grid.indices(code.detach())[:, 0]
         wrong: Tensor = F.cross_entropy(self.classify(z), index, reduction="none")
         return rebuilt + wrong
 
@@ -215,5 +215,5 @@ class CodeHead(nn.Module):
         share = torch.special.ndtr(noise[:, 0].double())  # standard normal -> uniform
         mass = torch.softmax(self.classify(z).double(), dim=-1).cumsum(-1)
         index = (mass <= share * mass[:, -1:]).sum(-1, keepdim=True).clamp(max=mass.shape[-1] - 1)
-        out: Tensor = self.decode(indices_to_codes(index, self.levels)[:, 0])
+        out: Tensor = self.decode(self.grid.codes(index)[:, 0])
         return out

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.listeners.audio_frontend import SHAPES
-from sfms_robot.listeners.layers import Attention, Block, NormFeedForward, places_of
+from sfms_robot.listeners.layers import Attention, Block, NormFeedForward, mlp, places_of
 from sfms_robot.listeners.sfms.draw import Context, LastKeyframes
 from sfms_robot.listeners.sfms.quantizer import Grid
 from sfms_robot.signals.control import COLUMNS
@@ -144,11 +144,7 @@ class Predictor(nn.Module):
         self.chain = NormFeedForward(width) if settings.sequential else None
         self.norm = nn.LayerNorm(width)
         self.classify = nn.Linear(width, sum(self.classes))
-        self.control_in = (
-            nn.Sequential(nn.Linear(len(COLUMNS), width), nn.GELU(), nn.Linear(width, width))
-            if settings.events
-            else None
-        )
+        self.control_in = mlp(len(COLUMNS), width, width) if settings.events else None
 
     def forward(self, context: Context[Tensor], recent: LastKeyframes[Tensor] | None = None) -> Tensor:
         """Return (B, H, W): every future frame without knowledge of the keyframes drawn before it.

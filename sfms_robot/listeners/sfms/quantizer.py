@@ -23,57 +23,32 @@ DEAD = 0.05  # a vector used less than this share of the average starts again at
 HIDDEN = 48  # width of the network of one group
 
 
-def as_levels(levels: Sequence[Sequence[int]]) -> Tensor:
-    """Return integer levels as (G, D) float, for the arithmetic."""
-    return torch.tensor(levels, dtype=torch.float32)
-
-
-def quantize(latent: Tensor, levels: Tensor) -> Tensor:
-    """Return the nearest grid point of tanh(latent), (..., G, D) in -1..1; the gradient skips the rounding."""
-    # FSQ, section 3.1: bound, then round. Ours: tanh straight to -1..1, and an even number of levels needs no offset.
-    bounded = torch.tanh(latent)  # -1..1
-    position = (bounded + 1) / 2 * (levels - 1)  # 0..L - 1
-    code = torch.round(position) / (levels - 1) * 2 - 1
-    return bounded + (code - bounded).detach()  # straight through: d code / d bounded = 1
-
-
-def codes_to_indices(codes: Tensor, levels: Tensor, radix: Tensor | None = None) -> Tensor:
-    """Return indices (..., G), 0 to prod(levels) - 1, of codes (..., G, D) on the grid; `radix`: saves computing it."""
-    digits = torch.round((codes + 1) / 2 * (levels - 1)).long()
-    return (digits * (_radix(levels) if radix is None else radix)).sum(-1)
-
-
-def indices_to_codes(indices: Tensor, levels: Tensor) -> Tensor:
-    """Return the codes (..., G, D) of indices (..., G)."""
-    digits = indices[..., None] // _radix(levels) % levels.long()
-    return digits / (levels - 1) * 2 - 1
-
-
-def _radix(levels: Tensor) -> Tensor:
-    ones = torch.ones_like(levels[:, :1])
-    return torch.cat([ones, levels[:, :-1]], dim=-1).cumprod(-1).long()  # (G, D)
-
-
 class Grid(nn.Module):
-    """The fixed codebook of finite scalar quantization, which has no parameters."""
+    """The fixed codebook of finite scalar quantization, which has no parameters; `levels` (G, D)."""
 
     def __init__(self, levels: Sequence[Sequence[int]]) -> None:
         super().__init__()
-        self.levels = nn.Buffer(as_levels(levels), persistent=False)
-        self.radix = nn.Buffer(_radix(self.levels), persistent=False)
-        every = torch.arange(max(map(math.prod, levels)))[:, None].expand(-1, len(levels))
-        table = indices_to_codes(every, self.levels).transpose(0, 1)  # (G, V, D)
+        self.levels = nn.Buffer(torch.tensor(levels, dtype=torch.float32), persistent=False)
+        below = torch.cat([torch.ones_like(self.levels[:, :1]), self.levels[:, :-1]], dim=-1)
+        self.radix = nn.Buffer(below.cumprod(-1).long(), persistent=False)  # (G, D)
+        digits = torch.arange(max(map(math.prod, levels)))[:, None, None] // self.radix % self.levels.long()
+        table = (digits / (self.levels - 1) * 2 - 1).transpose(0, 1)  # (G, V, D)
         self.table = nn.Buffer(table.flatten(0, 1), persistent=False)
-        self.first = nn.Buffer(torch.arange(len(levels)) * len(every), persistent=False)  # row of each group
+        self.first = nn.Buffer(torch.arange(len(levels)) * len(digits), persistent=False)  # row of each group
         self.dims = len(levels[0])
 
     def nearest(self, latent: Tensor) -> Tensor:
-        """Return the codes (..., G, D) nearest to a latent; the gradient skips the rounding."""
-        return quantize(latent, self.levels)
+        """Return the grid point nearest to tanh(latent), (..., G, D) in -1..1; the gradient skips the rounding."""
+        # FSQ, section 3.1: bound, then round. Ours: tanh straight to -1..1, and an even number of levels needs no
+        # offset.
+        bounded = torch.tanh(latent)  # -1..1
+        position = (bounded + 1) / 2 * (self.levels - 1)  # 0..L - 1
+        code = torch.round(position) / (self.levels - 1) * 2 - 1
+        return bounded + (code - bounded).detach()  # straight through: d code / d bounded = 1
 
     def indices(self, codes: Tensor) -> Tensor:
-        """Return the indices (..., G) of codes (..., G, D)."""
-        return codes_to_indices(codes, self.levels, self.radix)
+        """Return the indices (..., G), 0 to prod(levels) - 1, of codes (..., G, D)."""
+        return (torch.round((codes + 1) / 2 * (self.levels - 1)).long() * self.radix).sum(-1)
 
     def codes(self, indices: Tensor) -> Tensor:
         """Return the codes (..., G, D) of indices (..., G)."""

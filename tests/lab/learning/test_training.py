@@ -25,7 +25,7 @@ from sfms_robot.listeners.audio_frontend import AudioFrontend
 from sfms_robot.listeners.registry import load_folder
 from sfms_robot.listeners.sfms.draw import UNDECIDED
 from sfms_robot.listeners.sfms.model import SfmsModel
-from sfms_robot.listeners.sfms.quantizer import as_levels, indices_to_codes
+from sfms_robot.listeners.sfms.quantizer import Grid
 from sfms_robot.listeners.space import MotionSpace
 
 ARKIT = MotionSpace("arkit58", np.zeros(58))
@@ -213,10 +213,10 @@ def test_the_predictor_trains_on_tokens_of_each_window(data, tmp_path):
 
 
 def test_a_perturbed_history_moves_keyframes_by_one_level_and_nothing_else():
-    levels, tokens = as_levels([[5, 3]]), torch.randint(0, 16, (4, 40, 1))
-    moved = listener.perturb(tokens, levels, 1.0, torch.Generator().manual_seed(0))
+    grid, tokens = Grid([[5, 3]]), torch.randint(0, 16, (4, 40, 1))
+    moved = listener.perturb(tokens, grid, 1.0, torch.Generator().manual_seed(0))
     assert torch.equal(moved > 0, tokens > 0)
     key = (tokens > 0)[..., 0]
-    before, after = (indices_to_codes((t - 1).clamp(min=0), levels)[key] for t in (tokens, moved))
-    steps = (after - before).abs() / (2 / (levels - 1))
+    before, after = (grid.codes((t - 1).clamp(min=0))[key] for t in (tokens, moved))
+    steps = (after - before).abs() / (2 / (grid.levels - 1))
     assert (steps.sum(-1) < 1.001).all()

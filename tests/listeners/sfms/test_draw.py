@@ -14,7 +14,6 @@ from sfms_robot.lab.evaluation.detection import Detected, added_up, asked_and_se
 from sfms_robot.lab.evaluation.rollout import rollout
 from sfms_robot.listeners.registry import at_hop, load_listener
 from sfms_robot.listeners.sfms import draw
-from sfms_robot.listeners.sfms.quantizer import indices_to_codes
 from sfms_robot.signals.control import COLUMNS, control_track
 
 SMILE = ListenerEvent("smile", 0.6, 2.4, 0.5)
@@ -203,7 +202,7 @@ def test_a_code_may_follow_itself_class_0_anything_and_without_bounds_every_code
 def test_allowed_codes_are_exactly_those_no_channel_has_to_hurry_for():
     model, reach = listener_with_speed(0.1)
     quantizer = model.tokenizer.quantizer
-    codes = indices_to_codes(torch.arange(6)[:, None].expand(6, 2), quantizer.codebook.levels)
+    codes = quantizer.codebook.codes(torch.arange(6)[:, None].expand(6, 2))
     neck = quantizer.decode(codes[None])[0, :, :6].detach()
     for gap in (1, 5, 20):
         allowed = ~reach.too_soon(np.array([[3, 0]]), np.array([[gap, gap]]))[0, 0, 1:7]

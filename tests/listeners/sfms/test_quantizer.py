@@ -3,14 +3,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.listeners.sfms.quantizer import (
-    Codebook,
-    Quantizer,
-    as_levels,
-    codes_to_indices,
-    indices_to_codes,
-    quantize,
-)
+from sfms_robot.listeners.sfms.quantizer import Codebook, Grid, Quantizer
 
 grids = st.integers(1, 4).flatmap(
     lambda dims: st.lists(st.lists(st.integers(2, 6), min_size=dims, max_size=dims), min_size=1, max_size=3)
@@ -18,28 +11,28 @@ grids = st.integers(1, 4).flatmap(
 
 
 @given(grids)
-def test_every_index_is_the_index_of_its_code(grid: list[list[int]]):
-    levels = as_levels(grid)
-    sizes = levels.prod(-1).long()
+def test_every_index_is_the_index_of_its_code(levels: list[list[int]]):
+    grid = Grid(levels)
+    sizes = grid.levels.prod(-1).long()
     indices = torch.stack([torch.arange(int(sizes.max())) % size for size in sizes], dim=-1)
-    codes = indices_to_codes(indices, levels)
-    assert torch.equal(codes_to_indices(codes, levels), indices)
+    codes = grid.codes(indices)
+    assert torch.equal(grid.indices(codes), indices)
     for group, size in enumerate(sizes):
         assert len(codes[: int(size), group].unique(dim=0)) == size
 
 
 @given(grids, st.integers(0, 1000))
-def test_a_quantized_value_is_on_the_grid_and_the_nearest_there(grid: list[list[int]], seed: int):
-    levels = as_levels(grid)
-    latent = torch.randn(5, *levels.shape, generator=torch.Generator().manual_seed(seed)) * 2
-    code = quantize(latent, levels)
-    torch.testing.assert_close(indices_to_codes(codes_to_indices(code, levels), levels), code)
-    assert ((code - torch.tanh(latent)).abs() <= 1 / (levels - 1) + 1e-5).all()
+def test_a_quantized_value_is_on_the_grid_and_the_nearest_there(levels: list[list[int]], seed: int):
+    grid = Grid(levels)
+    latent = torch.randn(5, *grid.levels.shape, generator=torch.Generator().manual_seed(seed)) * 2
+    code = grid.nearest(latent)
+    torch.testing.assert_close(grid.codes(grid.indices(code)), code)
+    assert ((code - torch.tanh(latent)).abs() <= 1 / (grid.levels - 1) + 1e-5).all()
 
 
 def test_the_gradient_passes_through_the_rounding():
     latent = torch.zeros(1, 1, 2, requires_grad=True)
-    quantize(latent, as_levels([[4, 5]])).sum().backward()
+    Grid([[4, 5]]).nearest(latent).sum().backward()
     torch.testing.assert_close(latent.grad, torch.ones(1, 1, 2))
 
 

@@ -32,7 +32,7 @@ from sfms_robot.lab.learning.training_loop import digest_of, fit, optimizer
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context
 from sfms_robot.listeners.sfms.model import SfmsModel, neutral_tokens
-from sfms_robot.listeners.sfms.quantizer import Grid, codes_to_indices, indices_to_codes
+from sfms_robot.listeners.sfms.quantizer import Grid
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.signals.mel import LN_PER_DB
 
@@ -88,7 +88,7 @@ def listener_job(
     eventful = starts_with_events(corpus, starts, listener) if phase.event_windows else starts
     dense = keyframe_tokens(model, motion) if phase.missed_keyframes else lessons.tokens
     codebook = model.tokenizer.quantizer.codebook
-    levels = codebook.levels if isinstance(codebook, Grid) else None
+    grid = codebook if isinstance(codebook, Grid) else None
     costs = torch.tensor(model.tokenizer.costs, device=device)
 
     def loss_of(step: int, generator: Generator, batch: int) -> Tensor:
@@ -101,7 +101,7 @@ def listener_job(
         chosen = chosen.to(device, non_blocking=True)
         noise = noise_of(generator, device)
         seen, target = lessons.at(chosen, louder)
-        seen = augment(seen, levels, neutral, phase, noise)
+        seen = augment(seen, grid, neutral, phase, noise)
         meant = torch.cat([seen.tokens[:, : listener.past_frames], target], dim=1)
         count = _drawn(listener, target, generator)
         if phase.missed_keyframes:
@@ -227,7 +227,7 @@ def _loss(
 
 def augment(
     seen: Context[Tensor],
-    levels: Tensor | None,
+    grid: Grid | None,
     neutral: Tensor,
     training: config.PredictorTraining,
     generator: Generator,
@@ -240,7 +240,7 @@ def augment(
     device = seen.tokens.device
     heard = seen.heard & (uniform(generator, b, 1) >= training.drop_audio)
     known = seen.face_known & (uniform(generator, b, 1) >= training.drop_face)
-    past = perturb(seen.tokens[:, :p], levels, training.history_noise, generator)
+    past = perturb(seen.tokens[:, :p], grid, training.history_noise, generator)
     # Neutral prefix (IV-C): the first frames are as a stream begins, with nothing heard or seen.
     cold = uniform(generator, b, 1) < training.neutral_prefix
     cut = torch.randint(1, p + 1, (b, 1), generator=generator, device=device)
@@ -254,24 +254,23 @@ def augment(
     return seen._replace(heard=heard & ~before, face_known=known & ~before, tokens=tokens, control=control)
 
 
-def perturb(tokens: Tensor, levels: Tensor | None, share: float, generator: Generator) -> Tensor:
+def perturb(tokens: Tensor, grid: Grid | None, share: float, generator: Generator) -> Tensor:
     """Move a share of the keyframes by one level in one dimension: in a roll-out the past is the model's own.
 
-    Without levels (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.
+    Without a grid (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.
     """
     if not is_drawn(generator, share):
         return tokens
     place = generator.device
     changed = (tokens > 0) & (uniform(generator, *tokens.shape) < share)
-    if levels is None:
+    if grid is None:
         return torch.where(changed, 0, tokens)
-    codes = indices_to_codes((tokens - 1).clamp(min=0), levels)
-    dims = levels.shape[1]
+    codes, dims = grid.codes((tokens - 1).clamp(min=0)), grid.dims
     dimension = torch.randint(dims, tokens.shape, generator=generator, device=place)
     sign = torch.randint(2, tokens.shape, generator=generator, device=place)[..., None] * 2 - 1
     moved = F.one_hot(dimension, dims) * sign
-    noisy = (codes + moved * 2 / (levels - 1)).clamp(-1.0, 1.0)
-    return torch.where(changed, codes_to_indices(noisy, levels) + 1, tokens)
+    noisy = (codes + moved * 2 / (grid.levels - 1)).clamp(-1.0, 1.0)
+    return torch.where(changed, grid.indices(noisy) + 1, tokens)
 
 
 @torch.no_grad()
