@@ -77,6 +77,7 @@ class RunsOnEngine:
         hop: frames from one plan to the next; hops: those that `at_hop` takes.
         horizon: frames of a plan.
         control_frames: rows of control that a step takes, up to the newest frame and after it; (0, 0) without events.
+        control_columns: numbers of such a row; 0 without events.
     """
 
     engine: Engine
@@ -84,6 +85,7 @@ class RunsOnEngine:
     hops: Sequence[int] = (1,)
     horizon: int = 1
     control_frames: tuple[int, int] = (0, 0)
+    control_columns: int = 0
 
     def at_hop(self, hop: int) -> Self:
         """Return a listener of the same weights that plans every `hop` frames, one of `hops`."""
@@ -122,6 +124,18 @@ class RunsOnEngine:
         first frame that is refused; then no stream has moved.
         """
         raise NotImplementedError
+
+    def told(self, controls: Sequence[Floats | None]) -> Floats:
+        """Return controls as of `step` of N streams (N, P + A, K); (N, 0, 0) without events.
+
+        Raises ValueError for another shape.
+        """
+        wanted = sum(self.control_frames), self.control_columns
+        rows = [np.zeros((0, 0), np.float32) if control is None else control for control in controls]
+        for row in rows:
+            if row.shape != wanted:
+                raise ValueError(f"control has shape {row.shape}, not {wanted}")
+        return stacked(rows).astype(np.float32)
 
     def standardise(self, motion: Floats) -> Floats:
         """Return motion (..., C) of the motion space in the units of the model."""
@@ -211,7 +225,11 @@ def read_graphs(folder: Path, settings: config.ListenerSettings, integers: bool 
     file, remedy = folder / FOLDER / MANIFEST, f"export them again: sfms-robot export {folder}"
     try:
         manifest = json.loads(file.read_text(encoding="utf-8"))
-        version, made_for, networks = manifest["format"], manifest["settings"], manifest["networks"]
+        version, made_for = manifest["format"], manifest["settings"]
+        networks = {
+            name: (each["sha256"], tuple(each["weights"]), tuple(each.get("integers", ())))
+            for name, each in manifest["networks"].items()
+        }
         wanted = {name: (tuple(shape), real) for name, (shape, real) in manifest["tensors"].items()}
     except OSError:
         raise ModelError(f"{file}: no graphs of this listener for engine onnx; {remedy}") from None
@@ -224,14 +242,14 @@ def read_graphs(folder: Path, settings: config.ListenerSettings, integers: bool 
     found = {}
     for name in {network.removesuffix(".int8") for network in networks}:
         chosen = f"{name}.int8" if integers and f"{name}.int8" in networks else name
-        graph, known = folder / FOLDER / f"{chosen}.onnx", networks[chosen]
+        graph, (known, weights, rounded) = folder / FOLDER / f"{chosen}.onnx", networks[chosen]
         try:
             data = graph.read_bytes()
         except OSError:
             raise ModelError(f"{graph}: no such graph; {remedy}") from None
-        if hashlib.sha256(data).hexdigest() != known["sha256"]:
+        if hashlib.sha256(data).hexdigest() != known:
             raise ModelError(f"{graph}: cut short, or of another model than {MANIFEST} next to it; {remedy}")
-        found[name] = Graph(data, tuple(known["weights"]), tuple(known.get("integers", ())))
+        found[name] = Graph(data, weights, rounded)
     return GraphFolder(found, wanted)
 
 
@@ -325,7 +343,7 @@ def _session(failure: str, graph: Graph, values: Mapping[str, Any], threads: int
     try:
         return onnxruntime.InferenceSession(graph.data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has no class of its own for faults of a file
-        why = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        why = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise ModelError(f"{failure}: {why}") from error
 
 

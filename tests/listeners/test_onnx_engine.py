@@ -118,7 +118,8 @@ def test_a_listener_without_graphs_runs_on_torch_unless_onnx_is_asked_for(copied
 
 
 def test_a_manifest_that_is_none_is_refused_and_with_auto_leaves_the_listener_to_torch(copied, caplog):
-    for text in ("[]", "{", json.dumps({"format": 99, "settings": "", "networks": {}, "tensors": {}})):
+    whole = json.loads((copied / "onnx" / "graphs.json").read_text())
+    for text in ("[]", "{", json.dumps(whole | {"format": 99}), json.dumps(whole | {"networks": {"next": {}}})):
         (copied / "onnx" / "graphs.json").write_text(text)
         assert "graphs.json: " in refused(copied)
     (copied / "onnx" / "graphs.json").write_text("{")

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -165,24 +165,7 @@ REMEMBERED: Final = (
     "motion_keys",
     "sample",
 )
-
-
-class BothPeople(NamedTuple):
-    """One frame of both people, of N streams.
-
-    Attributes:
-        sounds: (N, 2, A) features of user and agent; present: (N, 2) which of them there are.
-        voiced: (N, 2) whether agent and user speak.
-        face: (N, C) the user's, standardised; seen: (N,) whether there is one.
-        voices: of each stream the audio states of user and agent after the frame.
-    """
-
-    sounds: Floats
-    present: Bools
-    voiced: Bools
-    face: Floats
-    seen: Bools
-    voices: list[tuple[AudioState, AudioState]]
+_MADE: Final = (*REMEMBERED[:4], "standard", "sample", "motion", "motion_keys")  # by the networks, with every frame
 
 
 class ArigListener(RunsOnEngine):
@@ -204,7 +187,7 @@ class ArigListener(RunsOnEngine):
         self.space = MotionSpace.of(settings, folder)
         self.sway = HeadSway(settings, engine.tensors)
         if settings.events:
-            self.control_frames = (1, CONTROL_ROWS - 1)
+            self.control_frames, self.control_columns = (1, CONTROL_ROWS - 1), len(COLUMNS)
         self.noise_shape = (1, 1) if settings.discrete else (settings.diffusion.steps, len(settings.channels))
 
     def start(self, seed: int) -> ArigMemory:
@@ -242,59 +225,47 @@ class ArigListener(RunsOnEngine):
         controls: Sequence[Floats | None] | None = None,
     ) -> list[tuple[Plan | None, ArigMemory]]:
         """Move every stream one frame on; each plans its next frame."""
-        rows = self._rows(controls or [None] * len(memories))
-        heard = self._hear(speakers, memories)
-        # 1. Everything before the sampler, 2. noise, a function of seed and frame, 3. the sampler, 4. sway and states.
-        z, logits, now = self._conditions(heard, memories, rows)
+        settings = self.settings
+        rows = self.told(controls or [None] * len(memories)).reshape(len(memories), -1)
+        sounds, present, face, seen, now = self._hear(speakers, memories)
+        voiced = np.array([(memory.agent_voice.voiced, memory.user_voice.voiced) for memory in now])
+        newest = np.array([memory.frames for memory in now])
+        # 1. Everything before the sampler (3.2). Chunk i holds frames c i to c (i + 1) - 1; of the w chunks in view,
+        # w - 1 are whole.
+        chunks, room = (newest - 1) // settings.chunk_frames, settings.context_chunks - 1
+        z, logits, summaries, *kept = self.engine.run(
+            "frame",
+            sounds,
+            present,
+            voiced,
+            face,
+            seen,
+            newest == 1,
+            np.array([memory.state for memory in now]),
+            rotary(chunks, settings.width // settings.heads),
+            np.arange(room) >= room - np.minimum(chunks, room)[:, None],  # the newest chunks are last
+            *(_stacked(now, name) for name in REMEMBERED),
+            rows,
+            *(stacked([memory.context[part] for memory in now]) for part in range(2 * settings.context_layers)),
+        )
+        # 2. Noise, a function of seed and frame, 3. the sampler, 4. sway and states.
         noise = np.stack([normals(memory.seed, memory.frames, Use.NOISE, *self.noise_shape) for memory in now])
         inputs = [z, noise, _stacked(now, "standard"), _stacked(now, "motion_keys")]
-        told = [rows, heard.voiced[:, 0]] if self.settings.events else []
-        made, *drawn = self.engine.run("draw", *inputs, *told)
-        newest = np.array([memory.frames for memory in now])
+        made, *drawn = self.engine.run("draw", *inputs, *([rows, voiced[:, 0]] if settings.events else []))
         shown = self.sway.added(made[:, None].copy(), _stacked(now, "sway"), newest)
-        sojourns, states = self._states(logits, now, rows, heard)
+        sojourns, states = self._states(logits, now, rows, voiced)
         out: list[tuple[Plan | None, ArigMemory]] = []
-        for index, memory in enumerate(now):
-            time_s = speakers[index].time_s
+        for index, (speaker, memory) in enumerate(zip(speakers, now, strict=True)):
             frames, jaw_rad = self.space.decode(shown[index])
-            plan = Plan(time_s, np.array([time_s + FRAME_S]), frames, jaw_rad)
-            own = dict(
-                zip(("standard", "sample", "motion", "motion_keys"), (part[index] for part in drawn), strict=True)
-            )
+            plan = Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), frames, jaw_rad)
+            own: dict[str, Any] = dict(zip(_MADE, (part[index] for part in (*kept, *drawn)), strict=True))
+            if memory.frames % settings.chunk_frames == 0:  # the chunk is whole: its keys and values stay (3.2)
+                own["context"] = np.concatenate([memory.context[:, :, 1:], summaries[index][:, :, None]], axis=2)
             out.append((plan, changed(memory, **own, state=states[index], sojourn=sojourns[index])))
         return out
 
-    def _conditions(
-        self, heard: BothPeople, memories: Sequence[ArigMemory], rows: Floats
-    ) -> tuple[Floats, Floats, list[ArigMemory]]:
-        """Return the sampler's inputs (N, its width), logits of the states (N, S), and memories without its draws."""
-        settings = self.settings
-        # 3.2: chunk i holds frames c i to c (i + 1) - 1; of the w chunks in view, w - 1 are whole.
-        passed = np.array([memory.frames for memory in memories])
-        chunks, room = passed // settings.chunk_frames, settings.context_chunks - 1
-        z, logits, made, *rest = self.engine.run(
-            "frame",
-            *heard[:5],
-            passed == 0,
-            np.array([memory.state for memory in memories]),
-            rotary(chunks, settings.width // settings.heads),
-            np.arange(room) >= room - np.minimum(chunks, room)[:, None],  # the newest chunks are last
-            *(_stacked(memories, name) for name in REMEMBERED),
-            rows,
-            *(stacked([memory.context[part] for memory in memories]) for part in range(2 * settings.context_layers)),
-        )
-        after = []
-        for index, ((user, agent), memory) in enumerate(zip(heard.voices, memories, strict=True)):
-            frames, context = memory.frames + 1, memory.context
-            if frames % settings.chunk_frames == 0:  # the chunk is whole: its keys and values stay (3.2)
-                context = np.concatenate([context[:, :, 1:], made[index][:, :, None]], axis=2)
-            own = dict(zip(REMEMBERED[:4], (part[index] for part in rest), strict=True))
-            voices = {"user_voice": user, "agent_voice": agent}
-            after.append(changed(memory, **own, **voices, frames=frames, context=context))
-        return z, logits, after
-
     def _states(
-        self, logits: Floats, now: Sequence[ArigMemory], rows: Floats, heard: BothPeople
+        self, logits: Floats, now: Sequence[ArigMemory], rows: Floats, voiced: Bools
     ) -> tuple[list[Sojourn], list[int]]:
         """Return states of the frame that is made: the most probable, or drawn where the model has events."""
         before = [memory.sojourn for memory in now]
@@ -305,33 +276,29 @@ class ArigListener(RunsOnEngine):
         durations, possible = (self.engine.tensors[f"states.{name}"] for name in ("durations", "possible"))
         # Ours: a state lasts as long as in the data, and feedback that is seen comes from the events.
         sojourns = [
-            draw_sojourn(durations, possible, scores, voiced, last, uniforms(own.seed, own.frames, Use.STATE, 2))
-            for scores, voiced, last, own in zip(logits, heard.voiced, before, now, strict=True)
+            draw_sojourn(durations, possible, scores, both, last, uniforms(own.seed, own.frames, Use.STATE, 2))
+            for scores, both, last, own in zip(logits, voiced, before, now, strict=True)
         ]
         # A nod or a smile under way makes listening a state of its own.
         drawn = np.array([sojourn.state for sojourn in sojourns])
         return sojourns, with_feedback(drawn, rows[:, -len(COLUMNS) :]).tolist()
 
-    def _rows(self, controls: Sequence[Floats | None]) -> Floats:
-        """Return the control of N streams as (N, 2K), 0 where it is None; (N, 0) without events."""
-        wanted = (CONTROL_ROWS, len(COLUMNS))
-        if not self.settings.events:
-            if any(control is not None for control in controls):
-                raise ValueError("control is for a listener with events: true")
-            wanted = (0, 0)
-        rows = [np.zeros(wanted, np.float32) if control is None else np.asarray(control) for control in controls]
-        for row in rows:
-            if row.shape != wanted:
-                raise ValueError(f"control is {row.shape}, not {wanted}")
-        return np.stack(rows).astype(np.float32).reshape(len(rows), -1)
+    def _hear(
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory]
+    ) -> tuple[Floats, Bools, Floats, Bools, list[ArigMemory]]:
+        """Return both people in the newest frame of each of N streams, and memories of their voices up to it.
 
-    def _hear(self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory]) -> BothPeople:
-        """Return both people in the newest frame of each stream."""
+        Features (N, 2, A) of user and agent, which of them there are (N, 2), the user's standardised face (N, C), and
+        whether there is one (N,).
+        """
         # Equation (2): A^u_(T-1) of the user, and A^a_T of the agent, which is one frame ahead.
         samples = [track for one in speakers for track in (one.audio, fit_frame(one.agent_audio))]
         before = [voice for memory in memories for voice in (memory.user_voice, memory.agent_voice)]
         sounds, present, after = hear_each(samples, before)
-        voices = list(zip(after[::2], after[1::2], strict=True))
+        now = [
+            changed(memory, frames=memory.frames + 1, user_voice=user, agent_voice=agent)
+            for memory, user, agent in zip(memories, after[::2], after[1::2], strict=True)
+        ]
         face = np.zeros((len(speakers), len(self.settings.channels)), np.float32)
         seen = np.zeros(len(speakers), np.bool_)
         for row, speaker in enumerate(speakers):
@@ -339,8 +306,7 @@ class ArigListener(RunsOnEngine):
             motion = None if speaker.face is None else speaker.face.motion
             if motion is not None and np.abs(motion).max() < BEYOND:  # false for NaN too
                 face[row], seen[row] = self.standardise(self.space.encode(motion[None]))[0], True
-        voiced = np.array([(agent.voiced, user.voiced) for user, agent in voices])
-        return BothPeople(sounds.reshape(len(voices), 2, -1), np.reshape(present, (-1, 2)), voiced, face, seen, voices)
+        return sounds.reshape(len(now), 2, -1), np.reshape(present, (-1, 2)), face, seen, now
 
 
 def _stacked(parts: Sequence[Any], name: str) -> NDArray[Any]:

@@ -116,11 +116,10 @@ class SfmsListener(RunsOnEngine):
         # Smoothing is of the head alone: its codes are coarse, and corners of its path make servos audible.
         self._smoothing = np.array([channel in HEAD for channel in settings.channels], np.float32)
         self._smoothing *= np.float32(settings.sampling.smoothing)
-        self._columns = len(COLUMNS) if settings.events else 0
         self.hop, self.horizon = settings.hop_frames, settings.future_frames
         self.hops = range(1, self.horizon + 1) if settings.hop == "auto" else (self.hop,)
         if settings.events:
-            self.control_frames = (settings.past_frames, self.horizon)
+            self.control_frames, self.control_columns = (settings.past_frames, self.horizon), len(COLUMNS)
         # Penalised keyframes hold until the next one: one that leaves the window has to be kept.
         self.holds = settings.placement == "penalised"
         # A stream begins with a still, neutral face: the paper trains with a neutral sequence before each clip (IV-C).
@@ -166,7 +165,7 @@ class SfmsListener(RunsOnEngine):
     def start(self, seed: int) -> SfmsMemory:
         """Return the memory of a stream without sound so far and with a neutral face."""
         tokens, path = self.at_rest()
-        control = np.zeros((len(tokens), self._columns), np.float32)
+        control = np.zeros((len(tokens), self.control_columns), np.float32)
         return SfmsMemory(
             seed=seed,
             frames=0,
@@ -210,7 +209,8 @@ class SfmsListener(RunsOnEngine):
             found.append((None, changed(memory, frames=memory.frames + 1, speaker=heard[same])))
         due = [row for row, memory in enumerate(memories) if self.is_due(memory)]  # as of the frame before
         if due:
-            control = self.told([None if controls is None else controls[row] for row in due])
+            told = self.told([None if controls is None else controls[row] for row in due])
+            control = told.reshape(len(due), self.settings.window_frames, self.control_columns)
             planned = self._planned([speakers[row].time_s for row in due], [found[row][1] for row in due], control)
             for row, each in zip(due, planned, strict=True):
                 found[row] = each
@@ -251,22 +251,6 @@ class SfmsListener(RunsOnEngine):
             after = changed(memory, speaker=speakers[row], tokens=tokens[row], control=control[row], path=path[row])
             found.append((plan, after))
         return found
-
-    def told(self, controls: Sequence[Floats | None]) -> Floats:
-        """Return controls as of `step` for the predictor, (B, P + H, K).
-
-        Raises ValueError for another shape, and for None with a listener that needs control.
-        """
-        wanted = (sum(self.control_frames), self._columns)
-        if not self._columns and all(one is None for one in controls):
-            return np.zeros((len(controls), self.settings.window_frames, 0), np.float32)
-        given = [one for one in controls if one is not None]
-        if len(given) < len(controls):
-            raise ValueError(f"this listener takes events: control {wanted} is missing")
-        if any(one.shape != wanted for one in given):
-            shapes = ", ".join(str(one.shape) for one in given)
-            raise ValueError(f"control has shape {shapes}, not {len(given)} times {wanted}")
-        return stacked(given).astype(np.float32)
 
     def with_sway(self, shown: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
         """Return motion in the model's space of standardised motion (..., N, C), with the slow motion of the head.

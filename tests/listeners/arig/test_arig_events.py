@@ -52,14 +52,14 @@ def test_later_control_never_changes_earlier_plans(told, changed_from: int):
 
 @pytest.mark.parametrize("shape", [(2, 5), (1, len(COLUMNS)), (3, len(COLUMNS)), (len(COLUMNS),)])
 def test_control_of_another_shape_is_refused(told, shape):
-    with pytest.raises(ValueError, match="control is"):
+    with pytest.raises(ValueError, match="control has shape"):
         told.step(talk(1)[0], told.start(1), np.zeros(shape, np.float32))
 
 
 def test_a_listener_without_events_takes_no_control():
     deaf = arig_listener()
     assert deaf.control_frames == (0, 0) and arig_listener(**TOLD).control_frames == (1, 1)
-    with pytest.raises(ValueError, match="control is for a listener with events: true"):
+    with pytest.raises(ValueError, match=r"control has shape \(2, 36\), not \(0, 0\)"):
         deaf.step(talk(1)[0], deaf.start(1), nods(2))
 
 
