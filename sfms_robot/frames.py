@@ -196,6 +196,11 @@ class SpeakerFrame:
     attention: float | None = None
     place_m: Floats | None = None
 
+    @property
+    def number(self) -> int:
+        """Return the index of the frame in loop time: frame 0 ends at 0.04 s."""
+        return round(self.time_s * FRAME_HZ) - 1
+
 
 # What a listener may decide to do. A laugh is heard and opens the mouth, a smile is only seen; "mm-hm" is for a voice.
 EVENT_KINDS: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "blink", "gaze_shift")

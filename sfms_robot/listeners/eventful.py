@@ -29,7 +29,6 @@ look at the person; memory holds what is still under way, no more.
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,9 +37,9 @@ from typing import Any, Final, Self
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import FRAME_HZ, Floats, ListenerEvent, Plan, SpeakerFrame, changed
+from sfms_robot.frames import Floats, ListenerEvent, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.engine import RunsOnEngine
-from sfms_robot.listeners.events.model import AT_PERSON, Decision, EventMemory, EventModel
+from sfms_robot.listeners.events.model import AT_PERSON, EventMemory, EventModel
 from sfms_robot.listeners.idle import IdleMotion, IdleStream
 from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.control import control_track
@@ -69,8 +68,8 @@ class EventfulMemory:
     idle: IdleStream | None = None
 
 
-class EventfulListener:
-    """A `engine.RunsOnEngine`: `when` decides, `how` moves, `idle` moves a face at rest. Holds weights only."""
+class EventfulListener(RunsOnEngine):
+    """A listener of parts: `when` decides, `how` moves, `idle` moves a face at rest. Takes no control."""
 
     def __init__(
         self, how: RunsOnEngine, when: EventModel, calmness: Calmness | None = None, idle: IdleMotion | None = None
@@ -80,8 +79,8 @@ class EventfulListener:
 
     def at_hop(self, hop: int) -> Self:
         """Return the same listener, planning every `hop` frames."""
-        other = copy.copy(self)
-        other.how, other.hop = self.how.at_hop(hop), hop
+        other = super().at_hop(hop)
+        other.how = self.how.at_hop(hop)
         return other
 
     def start(self, seed: int) -> EventfulMemory:
@@ -97,33 +96,24 @@ class EventfulListener:
         """Return the memory with other rates from now on."""
         return changed(memory, when=self.when.calmed(memory.when, calmness))
 
-    def step(self, speaker: SpeakerFrame, memory: EventfulMemory) -> tuple[Plan | None, EventfulMemory]:
-        """Take one frame; return a plan on every `hop`-th, None between, and the memory after it."""
-        return self.step_each([speaker], [memory])[0]
-
     def step_each(
-        self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory]
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory], controls: object = None
     ) -> list[tuple[Plan | None, EventfulMemory]]:
         """Step several streams, as `engine.RunsOnEngine`."""
         past, ahead = self.how.control_frames
         decided = self.when.step_each(speakers, [memory.when for memory in memories])
         found: list[EventfulMemory] = []
-        controls: list[Floats | None] = []
-        for speaker, memory, (decision, when) in zip(speakers, memories, decided, strict=True):
+        rows: list[Floats | None] = []
+        for speaker, memory, (events, when) in zip(speakers, memories, decided, strict=True):
             gaze = memory.gaze[1:] or memory.gaze  # past the end of a plan the eyes stay
-            found.append(changed(memory, when=when, news=memory.news + decision.events, gaze=gaze))
+            found.append(changed(memory, when=when, news=memory.news + events, gaze=gaze))
             # Control rows of frames t - P + 1 to t + A, where frame t brings a plan.
-            due, first = self.how.is_due(memory.how), frame_of(speaker) + 1 - past
-            controls.append(control_track(when.done, first, past + ahead) if due else None)
-        moved = self.how.step_each([*map(_believed, speakers)], [memory.how for memory in found], controls)
-        return [
-            self._looking(plan, decision, changed(memory, how=how))
-            for (plan, how), (decision, _), memory in zip(moved, decided, found, strict=True)
-        ]
+            due, first = self.how.is_due(memory.how), speaker.number + 1 - past
+            rows.append(control_track(when.done, first, past + ahead) if due else None)
+        moved = self.how.step_each([*map(_believed, speakers)], [memory.how for memory in found], rows)
+        return [self._looking(plan, changed(memory, how=how)) for (plan, how), memory in zip(moved, found, strict=True)]
 
-    def _looking(
-        self, plan: Plan | None, decision: Decision, memory: EventfulMemory
-    ) -> tuple[Plan | None, EventfulMemory]:
+    def _looking(self, plan: Plan | None, memory: EventfulMemory) -> tuple[Plan | None, EventfulMemory]:
         """Return the plan with eyes, idle motion and the new events, and the memory after it."""
         if plan is None:
             return None, memory
@@ -136,7 +126,7 @@ class EventfulListener:
         if memory.idle is not None:
             silent_s = memory.when.sensed.hearing.own_voice_s + plan.times_s - plan.times_s[0]
             frames = memory.idle.added(frames, plan.times_s, silent_s)
-        drawn = changed(plan, frames=frames, events=memory.news, hazards_hz=decision.hazards_hz)
+        drawn = changed(plan, frames=frames, events=memory.news, hazards_hz=memory.when.hazards_hz)
         return drawn, changed(memory, news=(), gaze=(memory.gaze[0], *states))
 
 
@@ -147,11 +137,6 @@ def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
     pose = [abs(value) for value in speaker.face.pose.tolist()]
     near = max(pose[:3]) <= TURNED_RAD and max(pose[3:]) <= MOVED_M and not any(map(math.isnan, pose))
     return speaker if near else changed(speaker, face=None)
-
-
-def frame_of(speaker: SpeakerFrame) -> int:
-    """Return the index of a frame in loop time: frame 0 ends at 0.04 s."""
-    return round(speaker.time_s * FRAME_HZ) - 1
 
 
 def target_at(events: Sequence[ListenerEvent], time_s: float) -> tuple[float, float]:

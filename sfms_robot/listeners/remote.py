@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ConfigError, PacketError
-from sfms_robot.frames import FRAME_HZ, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import ListenerEvent, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.remote_messages import (
@@ -86,7 +86,7 @@ class RemoteListener:
         self._shown: deque[tuple[str, float]] = deque(maxlen=_SHOWN)
         self._asked_s = -math.inf
         self._waiting_since_s: float | None = None  # for an answer to a frame
-        self._skipped = self._unsent = self._refused_messages = 0
+        self._skipped = self._refused_messages = 0
         self._joins = self._losses = 0
 
     # --- before the loop ---------------------------------------------------------------------------------------------
@@ -113,11 +113,10 @@ class RemoteListener:
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
         """Send a frame. Never blocks."""
         if self._welcome is None:
-            self._unsent += 1
+            self._skipped += 1
             return
         theirs_s = self._clock.theirs(now_s)
-        number = round(frame.time_s * FRAME_HZ) - 1
-        sent = SentFrame(number, frame, now_s, math.nan if theirs_s is None else theirs_s)
+        sent = SentFrame(frame.number, frame, now_s, math.nan if theirs_s is None else theirs_s)
         self._link.send(frame_message(sent))
         if self._waiting_since_s is None:
             self._waiting_since_s = now_s
@@ -125,7 +124,10 @@ class RemoteListener:
     def poll(self, now_s: float) -> Sequence[Plan]:
         """Return plans whose turn it is. Never blocks, never raises."""
         self._attend(now_s)
-        self._supervise(now_s)
+        silent_s = 0.0 if self._waiting_since_s is None else now_s - self._waiting_since_s
+        if self._state == "listening" and silent_s > HUNG_S:  # though frames went out
+            log.warning("%s%s has not answered for %.1f s", PREFIX, self._name, silent_s)
+            self._lose("hung")
         return [self._with_new_events(plan) for plan in self._buffer.take(now_s)]
 
     @property
@@ -148,18 +150,18 @@ class RemoteListener:
         return {
             "state": self._state,
             "restarts": max(0, self._joins - 1),
-            "skipped_frames": self._skipped + self._unsent,
+            "skipped_frames": self._skipped,
             "step_ms": self._step_ms.report(p50=50, p99=99),
-            "hop": None if welcome is None else welcome.hop,
+            "hop": welcome and welcome.hop,
             "budget_ms": None,
-            "why": None if self._refusal is None else self._refusal.reason,
+            "why": self._refusal and self._refusal.reason,
             "link": {
                 "to": self._link.where,
-                "server": None if welcome is None else welcome.server,
+                "server": welcome and welcome.server,
                 "round_trip_ms": self._rtt_ms.report(p50=50, p99=99),
                 "frame_to_plan_ms": self._delay_ms.report(p50=50, p99=99),
-                "clock_offset_s": None if best is None else round(best.offset_s, 4),
-                "clock_offset_within_ms": None if best is None else round(best.delay_s * 500, 2),
+                "clock_offset_s": best and round(best.offset_s, 4),
+                "clock_offset_within_ms": best and round(best.delay_s * 500, 2),
                 "buffer_ms": round(self._buffer.shift_s * 1e3, 1),
                 "lost_plans": self._buffer.lost,
                 "late_plans": self._buffer.late,
@@ -197,17 +199,18 @@ class RemoteListener:
             self._link.ask(words_message(Join(self._client, self._seed, calmness)))
 
     def _listen_to(self, said: Words, now_s: float) -> None:
-        if isinstance(said, Welcome):
-            self._join(said, now_s)
-        elif isinstance(said, Refusal) and self._state != "listening":
-            if self._refusal is None or self._refusal.reason != said.reason:
-                log.warning("%s%s: %s", PREFIX, self._name, said.reason)
-            self._refusal, self._welcome, self._state = said, None, "refused"
-        elif isinstance(said, Notice) and said.kind == "skipped":
-            self._skipped += said.frames
-        elif isinstance(said, Notice) and said.kind == "unknown" and self._state != "joining":
-            log.warning("%s%s was started again: joining again", PREFIX, self._name)
-            self._lose("joining")
+        match said:
+            case Welcome():
+                self._join(said, now_s)
+            case Refusal() if self._state != "listening":
+                if self._refusal is None or self._refusal.reason != said.reason:
+                    log.warning("%s%s: %s", PREFIX, self._name, said.reason)
+                self._refusal, self._welcome, self._state = said, None, "refused"
+            case Notice(kind="skipped"):
+                self._skipped += said.frames
+            case Notice(kind="unknown") if self._state != "joining":
+                log.warning("%s%s was started again: joining again", PREFIX, self._name)
+                self._lose("joining")
 
     def _join(self, welcome: Welcome, now_s: float) -> None:
         if self._welcome is not None and welcome.stream == self._welcome.stream:
@@ -244,15 +247,6 @@ class RemoteListener:
             self._rtt_ms.add(max(0.0, came_s - sent.echo_s - (sent.sent_s - sent.came_s)) * 1e3)
         self._buffer.put(sent.number, sent.plan, came_s)
 
-    def _supervise(self, now_s: float) -> None:
-        """Report a hang when nothing has come for long, though frames went out."""
-        if self._state != "listening" or self._waiting_since_s is None:
-            return
-        silent_s = now_s - self._waiting_since_s
-        if silent_s > HUNG_S:
-            log.warning("%s%s has not answered for %.1f s", PREFIX, self._name, silent_s)
-            self._lose("hung")
-
     def _lose(self, state: str) -> None:
         self._state, self._asked_s = state, -math.inf
         self._losses += 1
@@ -279,19 +273,9 @@ ANSWER_S: Final = 2.0  # that the answer to a request may take
 MOST_RECEIVED: Final = 1000  # messages that wait for `received`; the oldest are dropped
 
 
-def join_key(name: str) -> str:
-    """Return the key on which streams are requested."""
-    return f"{ROOT}/{name}/join"
-
-
-def up_key(name: str, stream: str) -> str:
-    """Return the key of messages from the robot."""
-    return f"{ROOT}/{name}/{stream}/up"
-
-
-def down_key(name: str, stream: str) -> str:
-    """Return the key of messages to the robot."""
-    return f"{ROOT}/{name}/{stream}/down"
+def listen_key(name: str, *parts: str) -> str:
+    """Return a key of a served listener: "join", on which streams are requested, or a stream and "up" or "down"."""
+    return "/".join((ROOT, name, *parts))
 
 
 class ZenohLink:
@@ -318,7 +302,7 @@ class ZenohLink:
         """Send a request to the servers of this name; every answer is among `received`."""
         session = self._connection.session
         if session is not None:
-            session.get(join_key(self._name), self._on_reply, payload=message, timeout=ANSWER_S)
+            session.get(listen_key(self._name, "join"), self._on_reply, payload=message, timeout=ANSWER_S)
 
     def follow(self, stream: str) -> None:
         """Receive messages of this stream from now on, and `send` to it."""
@@ -328,9 +312,9 @@ class ZenohLink:
         if session is None:
             return
         self._unfollow()
-        self._subscriber = session.declare_subscriber(down_key(self._name, stream), self._on_sample)
+        self._subscriber = session.declare_subscriber(listen_key(self._name, stream, "down"), self._on_sample)
         self._publisher = session.declare_publisher(
-            up_key(self._name, stream),
+            listen_key(self._name, stream, "up"),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME,
             express=True,  # not gathered into larger packets: that would take time

@@ -89,6 +89,7 @@ class JitterBuffer:
         hop: frames from one plan to the next.
 
     Attributes:
+        shift_s: what is added to the times of plans at this moment.
         lost, late, doubled: plans that never came, came after a newer one was played, or came twice.
     """
 
@@ -99,14 +100,9 @@ class JitterBuffer:
         self._waiting: dict[int, Plan] = {}  # by number
         self._given: int | None = None  # number of the newest plan given
         self._from_s = -math.inf  # plans made before it were delayed by an outage
-        self._shift_s = self._wanted_s = 0.0
+        self.shift_s = self._wanted_s = 0.0
         self._shifted_s: float | None = None  # when
         self.lost = self.late = self.doubled = 0
-
-    @property
-    def shift_s(self) -> float:
-        """Return what is added to the times of plans at this moment [s]."""
-        return self._shift_s
 
     def put(self, number: int, plan: Plan, came_s: float) -> None:
         """Add a plan, made for frame `number`, which came at `came_s`."""
@@ -150,16 +146,16 @@ class JitterBuffer:
         """Return whether it is the next in turn, or waiting longer for the one before is of no use."""
         if self._given is None or number <= self._given + self._hop:
             return True
-        return bool(now_s + MARGIN_S >= self._waiting[number].times_s[0] + self._shift_s)
+        return bool(now_s + MARGIN_S >= self._waiting[number].times_s[0] + self.shift_s)
 
     def _shifted(self, plan: Plan) -> Plan:
-        if not self._shift_s:
+        if not self.shift_s:
             return plan
-        events = tuple(replace(event, start_s=event.start_s + self._shift_s) for event in plan.events)
-        return replace(plan, times_s=plan.times_s + self._shift_s, events=events)
+        events = tuple(replace(event, start_s=event.start_s + self.shift_s) for event in plan.events)
+        return replace(plan, times_s=plan.times_s + self.shift_s, events=events)
 
     def _follow(self, now_s: float) -> None:
         """Update the shift: up at once, down slowly."""
         passed_s = 0.0 if self._shifted_s is None else max(0.0, now_s - self._shifted_s)
         self._shifted_s = now_s
-        self._shift_s = max(self._wanted_s, self._shift_s - SHRINKS * passed_s)
+        self.shift_s = max(self._wanted_s, self.shift_s - SHRINKS * passed_s)

@@ -8,7 +8,7 @@ from tiny_sfms import speech, told_listener
 
 from sfms_robot.config import Calmness
 from sfms_robot.frames import CHANNEL_INDEX, EVENT_KINDS, FRAME_S, FaceFrame
-from sfms_robot.listeners.eventful import EventfulListener, frame_of, target_at
+from sfms_robot.listeners.eventful import EventfulListener, target_at
 from sfms_robot.listeners.events.model import LEAD_FRAMES, EventModel
 from sfms_robot.signals.gaze_kinematics import directions
 
@@ -97,7 +97,7 @@ def test_a_stream_tells_times_of_the_run_and_at_hop_plans_as_often_and_decides_t
     plans, _ = plans_of(lively, later)
     events = [event for plan in plans for event in plan.events]
     assert events and all(100.0 < event.start_s < 108.2 for event in events)
-    assert frame_of(later[0]) == 2500
+    assert later[0].number == 2500
     speaker = speech(240)
     two, four = plans_of(lively, speaker)[0], plans_of(lively.at_hop(4), speaker)[0]
     assert len(two) == 2 * len(four)

@@ -27,7 +27,7 @@ from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
 from sfms_robot.errors import ConfigError, ModelError, PacketError, RobotError, optional
 from sfms_robot.frames import FRAME_S
 from sfms_robot.listeners.capacity import Capacity
-from sfms_robot.listeners.remote import ROOT, down_key, join_key
+from sfms_robot.listeners.remote import listen_key
 from sfms_robot.listeners.remote_messages import Join, Notice, parse_words, words_message
 from sfms_robot.listeners.stream_server import DEADLINE_S, Figures, report
 from sfms_robot.network import Router, check_name, check_zenoh, close_session, serve_session, session_config
@@ -264,18 +264,20 @@ def serve(
             "express": True,
         }
         with bar(f"loading {name}, and measuring how many heads it answers in time"):
-            pool = WorkerPool(served, lambda to, message: session.put(down_key(name, to), message, **now), processes)
+            pool = WorkerPool(
+                served, lambda to, message: session.put(listen_key(name, to, "down"), message, **now), processes
+            )
         stack.callback(pool.close)
 
         def join(query: zenoh.Query) -> None:
             if query.payload is not None:
-                pool.join(query.payload.to_bytes(), lambda answer: query.reply(join_key(name), answer))
+                pool.join(query.payload.to_bytes(), lambda answer: query.reply(listen_key(name, "join"), answer))
 
         def receive(sample: zenoh.Sample) -> None:
             pool.receive(str(sample.key_expr).split("/")[-2], sample.payload.to_bytes())
 
-        session.declare_queryable(join_key(name), join)
-        session.declare_subscriber(f"{ROOT}/{name}/*/up", receive)
+        session.declare_queryable(listen_key(name, "join"), join)
+        session.declare_subscriber(listen_key(name, "*", "up"), receive)
         if figures is not None:
             figures.begin(pool.statistics)
             say(f"metrics: {figures.url}")

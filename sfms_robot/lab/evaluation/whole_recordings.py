@@ -318,7 +318,7 @@ def steps_in(frames: int) -> Ints:
 def hazards_in(
     model: EventModel, heard: Doubles, own: Sequence[ListenerEvent], calmness: Calmness
 ) -> dict[str, Doubles]:
-    """Return `Decision.hazards_hz` of every frame, (N,) by kind, of evidence (N, len(HEARD)) and events in order."""
+    """Return `EventMemory.hazards_hz` of every frame, (N,) by kind, of evidence (N, len(HEARD)) and events in order."""
     steps = steps_in(len(heard))
     now_s = np.asarray((steps + 1) * FRAME_S, np.float64)
     spans_s = {kind: event_spans(own, kind) for kind in EVENT_KINDS}
@@ -427,8 +427,8 @@ def decisions(
     while ahead := [stream for stream in streams if stream.frame < len(heard)]:  # each at a time of its own
         sensed = [Sensed(stream.frame, heard[stream.frame]) for stream in ahead]
         decided = model.decide_each(sensed, [stream.memory for stream in ahead])
-        for stream, (decision, memory) in zip(ahead, decided, strict=True):
-            stream.take(decision.events, memory)
+        for stream, (events, memory) in zip(ahead, decided, strict=True):
+            stream.take(events, memory)
     return [tuple(stream.events) for stream in streams]
 
 

@@ -59,19 +59,7 @@ DONE: Final = (
     "log_rate",  # natural logarithm of nods a minute: a person's so far, a head's as it is set
 )  # fmt: skip
 EVIDENCE: Final = HEARD + DONE
-NUMBERS: Final = frozenset(
-    (
-        "one_speaks",
-        "several_speak",
-        "floor_mine",
-        "own_voice_known",
-        "gaze_known",
-        "looked_at",
-        "others_smile",
-        "root_nods_30s",
-        "log_rate",
-    )
-)
+NUMBERS: Final = frozenset(name for name in EVIDENCE if not name.endswith("_s"))  # the others are seconds
 AT: Final[Mapping[str, int]] = {name: index for index, name in enumerate(EVIDENCE)}
 FLOOR_FRAMES: Final = 25  # a phrase this long takes the floor
 SMILES_APART: Final = 25  # frames: a smile that is back before is the same one
@@ -412,8 +400,7 @@ def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemo
         smiles=signs.smiles,
     )
     heard, remembered = hear(instant, memory.hearing)
-    frame = round(speaker.time_s / FRAME_S) - 1
-    return Sensed(frame, heard), changed(watching, ear=ear, deaf=deaf, face=face, hearing=remembered)
+    return Sensed(speaker.number, heard), changed(watching, ear=ear, deaf=deaf, face=face, hearing=remembered)
 
 
 def sounds(own_voice: Floats | None) -> bool:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Final
@@ -204,17 +204,8 @@ EXCLUDES: Final[Mapping[str, frozenset[str]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Decision:
-    """The decision of one frame.
-
-    Attributes:
-        events: new ones; most frames have none.
-        hazards_hz: by kind, events a second if all evidence stayed the same; 0 while it cannot happen.
-    """
-
-    events: tuple[ListenerEvent, ...]
-    hazards_hz: Mapping[str, float]
+_NEVER: Final[Mapping[str, float]] = dict.fromkeys(EVENT_KINDS, 0.0)
+Decided = tuple[ListenerEvent, ...]  # with one frame: most have none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,14 +216,15 @@ class EventMemory:
         sensed: of the person.
         seed, calmness: of the stream.
         done: own events decided, in order, as far as they still matter.
-        hazards_hz: the last ones that were drawn.
+        hazards_hz: the last ones that were drawn, by kind: events a second if all evidence stayed the same; 0 while it
+            cannot happen.
     """
 
     sensed: SenseMemory
     seed: int
     calmness: Calmness
     done: tuple[ListenerEvent, ...] = ()
-    hazards_hz: Mapping[str, float] | None = None
+    hazards_hz: Mapping[str, float] = field(default_factory=lambda: _NEVER)
 
 
 class EventModel:
@@ -242,7 +234,6 @@ class EventModel:
         self.tables = tables
         self.bank = HazardBank(tables.hazards)
         self.draws = [EVENT_KINDS.index(kind) for kind in self.bank.kinds]
-        self._never: Mapping[str, float] = dict.fromkeys(EVENT_KINDS, 0.0)
         self.asked_odds = lru_cache(maxsize=64)(self._asked_odds)  # asked for with every frame, by all streams
 
     @classmethod
@@ -261,26 +252,24 @@ class EventModel:
 
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventMemory]
-    ) -> list[tuple[Decision, EventMemory]]:
+    ) -> list[tuple[Decided, EventMemory]]:
         """Take a frame of 40 ms of each stream; return what it decides, and the memory after it. Pure."""
         sensed = [sense(speaker, memory.sensed) for speaker, memory in zip(speakers, memories, strict=True)]
         decided = self.decide_each([one for one, _ in sensed], memories)
-        return [
-            (decision, changed(own, sensed=heard)) for (decision, own), (_, heard) in zip(decided, sensed, strict=True)
-        ]
+        return [(events, changed(own, sensed=heard)) for (events, own), (_, heard) in zip(decided, sensed, strict=True)]
 
     def decide_each(
         self,
         sensed: Sequence[Sensed],
         memories: Sequence[EventMemory],
         histories: Sequence[Sequence[ListenerEvent]] | None = None,
-    ) -> list[tuple[Decision, EventMemory]]:
+    ) -> list[tuple[Decided, EventMemory]]:
         """Draw the hazards of several streams, all of them together: the second half of `step_each`.
 
         `histories` replace the streams' own events; events that have not begun by now do not count. A gaze shift away
         is followed by one back when its time is over.
         """
-        found = [(Decision((), memory.hazards_hz or self._never), memory) for memory in memories]
+        found: list[tuple[Decided, EventMemory]] = [((), memory) for memory in memories]
         rows = [row for row, one in enumerate(sensed) if one.frame % STEP_FRAMES == STEP_FRAMES - 1]
         if rows:
             known = [memory.done for memory in memories]
@@ -295,13 +284,13 @@ class EventModel:
 
     def _drawn(
         self, sensed: Sensed, memory: EventMemory, history: Sequence[ListenerEvent], log_odds: Doubles, terms: Doubles
-    ) -> tuple[Decision, EventMemory]:
+    ) -> tuple[Decided, EventMemory]:
         """Return the events that are drawn, of log-odds (H,) as learned, and their terms (T,)."""
         now_s = (sensed.frame + 1) * FRAME_S
         odds = [own + more for own, more in zip(log_odds.tolist(), self.asked_odds(memory.calmness), strict=True)]
         may = _may_happen(sensed, history, now_s)
         draws = uniforms(memory.seed, sensed.frame, Use.EVENT, len(EVENT_KINDS))[self.draws]
-        hazards, events = dict(self._never), list(self._look_back(sensed.frame, history, now_s))
+        hazards, events = dict(_NEVER), list(self._look_back(sensed.frame, history, now_s))
         for at, kind in enumerate(self.bank.kinds):
             if kind not in may or memory.calmness.per_minute(kind) == 0:
                 continue
@@ -318,7 +307,7 @@ class EventModel:
                     )
                 )
         kept = remembered((*memory.done, *events), now_s) if events else memory.done
-        return Decision(tuple(events), hazards), changed(memory, done=kept, hazards_hz=hazards)
+        return tuple(events), changed(memory, done=kept, hazards_hz=hazards)
 
     def _evidence(self, sensed: Sensed, history: Sequence[ListenerEvent], calmness: Calmness) -> Doubles:
         """Return the evidence (len(EVIDENCE),) of a frame and of events before it."""

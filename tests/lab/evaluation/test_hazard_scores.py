@@ -107,8 +107,8 @@ def test_what_is_decided_is_what_deciding_every_frame_decides(speaker, asked):
     _, heard = sensed(speaker[:4000], asked)
     memory, every = when.start(7, asked), []
     for index, row in enumerate(heard):
-        ((decision, memory),) = when.decide_each([Sensed(index, row)], [memory])
-        every += decision.events
+        ((decided, memory),) = when.decide_each([Sensed(index, row)], [memory])
+        every += decided
     assert decisions(when, heard, [7], asked) == [tuple(every)] and "blink" in {event.kind for event in every}
 
 

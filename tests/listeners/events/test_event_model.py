@@ -65,10 +65,10 @@ def listen(frames, seed=1, calmness=None, own=None, memory=None):
     hazards = []
     for frame in frames:
         sensed, heard = sense(frame, memory.sensed)
-        ((decision, memory),) = MODEL.decide_each([sensed], [memory], None if own is None else [own])
+        ((decided, memory),) = MODEL.decide_each([sensed], [memory], None if own is None else [own])
         memory = replace(memory, sensed=heard)
-        events += decision.events
-        hazards.append(decision.hazards_hz["nod"])
+        events += decided
+        hazards.append(memory.hazards_hz["nod"])
     return events, np.array(hazards)
 
 
@@ -209,8 +209,8 @@ def test_hazards_are_finite_whatever_comes_in(rows):
         audio = np.full(FRAME_SAMPLES, level, np.float32) if heard else NOBODY
         with np.errstate(all="ignore"):
             speaker = SpeakerFrame((index + 1) * FRAME_S, audio, face, audio, attention)
-            ((decision, memory),) = MODEL.step_each([speaker], [memory])
-        assert all(math.isfinite(rate) and rate >= 0 for rate in decision.hazards_hz.values())
+            ((_, memory),) = MODEL.step_each([speaker], [memory])
+        assert all(math.isfinite(rate) and rate >= 0 for rate in memory.hazards_hz.values())
 
 
 # --- somebody's real history ------------------------------------------------------------------------------------
