@@ -12,7 +12,9 @@ between them, and while serving they are scaled by how long batches really take.
 
 from __future__ import annotations
 
+import math
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
@@ -26,7 +28,7 @@ SIZES: Final = (1, 2, 4, 8, 16, 32)
 GPU_SIZES: Final = (*SIZES, 64, 128, 256)  # of batches on a GPU, whose graphs are made by this
 ROUNDS: Final = 3  # plans that are measured at each size, after one that is not
 UNEVEN: Final = 1.2  # of 2 B: what the slowest of a hundred takes, measured
-_BISECTIONS: Final = 20
+_STEPS: Final = 1 << 20  # of the search for B
 
 
 # --- Batches ----------------------------------------------------------------------------------------------------------
@@ -73,24 +75,17 @@ class Capacity:
             return 0.0
         longest_s = 2 * deadline_s
 
-        def kept_up(b_s: float) -> bool:
+        def kept_up(step: int) -> bool:
+            b_s = step / _STEPS * longest_s
             frames = max(1.0, heads * b_s / FRAME_S)
             return self.batch_s(frames / self.hop, frames - frames / self.hop) <= b_s
 
-        if not kept_up(longest_s):
-            return float("inf")
-        low_s, high_s = 0.0, longest_s
-        for _ in range(_BISECTIONS):
-            middle_s = (low_s + high_s) / 2
-            low_s, high_s = (low_s, middle_s) if kept_up(middle_s) else (middle_s, high_s)
-        return 2 * high_s * UNEVEN
+        step = 1 + bisect_left(range(1, _STEPS + 1), True, key=kept_up)
+        return 2 * step / _STEPS * longest_s * UNEVEN if step <= _STEPS else math.inf
 
     def most(self, deadline_s: float) -> int:
         """Return the number of heads that are answered within the deadline."""
-        heads = 0
-        while self.delay_s(heads + 1, deadline_s) <= deadline_s and heads < 10_000:
-            heads += 1
-        return heads
+        return bisect_left(range(1, 10_001), True, key=lambda heads: self.delay_s(heads, deadline_s) > deadline_s)
 
 
 def measure_capacity(

@@ -211,7 +211,6 @@ AFTER_SPEECH_S: Final = 0.5  # a mouth rests; so much later it rests as people's
 MOUTH: Final = ("jaw", "mouth", "cheek", "nose", "tongue")  # what names of its channels begin with
 _OF_MOUTH: Final = np.array([name.startswith(MOUTH) for name in BLENDSHAPES])
 _ROUNDING: Final = 1e-6
-_TENSORS: Final = ("loadings", "amplitude", "spread", "held", "shown")
 
 
 @dataclass(frozen=True)
@@ -312,31 +311,30 @@ class IdleMotion:
 
     def save(self, file: Path) -> None:
         """Write the tensors to `file`. Raises ModelError if it cannot be written."""
-        write_tensors(file, {name: np.ascontiguousarray(getattr(self, name), np.float32) for name in _TENSORS})
+        write_tensors(file, {name: np.ascontiguousarray(value, np.float32) for name, value in vars(self).items()})
 
     @classmethod
     def load(cls, file: Path) -> IdleMotion:
         """Read `file`. Raises ModelError if it is missing, cut off, of another shape, or moves a face too far."""
         found = read_weights(file)
-        if set(found) != {*_TENSORS}:
-            raise ModelError(f"{file}: expected {', '.join(_TENSORS)}, got {', '.join(sorted(found))}")
-        loadings, amplitude, spread, held, shown = (found[name] for name in _TENSORS)
-        parts = len(loadings) if loadings.ndim else 0
-        shapes = [(parts, _COUNT), (IDLE_BANDS, parts), (KNOTS, _COUNT), (KNOTS, _COUNT)]
-        if [one.shape for one in (loadings, amplitude, held, shown)] != shapes or spread.size != 1:
-            raise ModelError(
-                f"{file}: loadings {loadings.shape}, amplitude {amplitude.shape}, spread {spread.shape}, held "
-                f"{held.shape}, shown {shown.shape}; expected (K, {_COUNT}), ({IDLE_BANDS}, K), one number and twice "
-                f"({KNOTS}, {_COUNT})"
-            )
+        parts = len(np.atleast_1d(found.get("loadings", np.zeros(0))))
+        wanted = {
+            "amplitude": (IDLE_BANDS, parts),
+            "held": (KNOTS, _COUNT),
+            "loadings": (parts, _COUNT),
+            "shown": (KNOTS, _COUNT),
+            "spread": (1,),
+        }
+        if (shapes := {name: found[name].shape for name in sorted(found)}) != wanted:
+            raise ModelError(f"{file}: expected tensors {wanted}, got {shapes}")
+        amplitude, held, loadings, shown, spread = (found[name] for name in wanted)
         steps = np.diff(np.stack([held, shown]).astype(np.float64), axis=1)
         if steps.min() < 0 or (steps[1] > STEEPEST * steps[0] + _ROUNDING).any():
             raise ModelError(f"{file}: held, shown: the map of rest falls, or is steeper than {STEEPEST:g}")
         largest = float(np.abs(loadings).max(initial=0.0) * np.linalg.norm(amplitude, axis=0).max(initial=0.0))
         largest = max(largest, float(np.abs(shown - held).max()))
-        if largest > LARGEST or not 0 <= float(spread.item()) <= 1:
+        if largest > LARGEST or not 0 <= spread[0] <= 1:
             raise ModelError(
-                f"{file}: expected motion up to {LARGEST:g} and a spread of 0..1, got {largest:.3g} and "
-                f"{float(spread.item()):.3g}"
+                f"{file}: expected motion up to {LARGEST:g} and a spread of 0..1, got {largest:.3g} and {spread[0]:.3g}"
             )
-        return cls(loadings, amplitude, float(spread.item()), held, shown)
+        return cls(loadings, amplitude, float(spread[0]), held, shown)

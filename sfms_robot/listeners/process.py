@@ -173,8 +173,8 @@ class ListenerProcess:
             "restarts": self._supervised.restarts,
             "skipped_frames": self._skipped,
             "step_ms": self._step_ms.report(p50=50, p99=99),
-            "hop": None if self._choice is None else self._choice.hop,
-            "budget_ms": None if self._choice is None else self._choice.budget_ms,
+            "hop": self._choice and self._choice.hop,
+            "budget_ms": self._choice and self._choice.budget_ms,
         }
 
     def close(self) -> None:

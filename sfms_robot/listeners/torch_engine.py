@@ -99,10 +99,8 @@ class BatchEngine(TorchEngine):
         key = (network, size, *(each.shape[1:] for each in tensors))
         with self._enough_memory(streams):
             if key not in self._batches:
-                batch = _NetworkBatch(self._networks[network], tensors, size, self._device)
-                if self._pool is not None and network != ONE_STREAM:
-                    batch.capture(self._pool)
-                self._batches[key] = batch
+                pool = None if network == ONE_STREAM else self._pool
+                self._batches[key] = _NetworkBatch(self._networks[network], tensors, size, self._device, pool)
             return self._batches[key].run(tensors, streams)
 
     @contextmanager
@@ -117,23 +115,24 @@ class BatchEngine(TorchEngine):
 
 
 class _NetworkBatch:
-    """Inputs of a network for `size` streams, which stay in place, and the graph that makes its outputs from them."""
+    """Inputs of a network for `size` streams, which stay in place, and the graph that makes its outputs from them.
 
-    def __init__(self, network: nn.Module, like: Sequence[Tensor], size: int, device: torch.device) -> None:
+    `pool`: memory of the graph; None: without one.
+    """
+
+    def __init__(self, network: nn.Module, like: Sequence[Tensor], size: int, device: torch.device, pool: Any) -> None:
         self._network = network
         self._inputs = [torch.zeros((size, *each.shape[1:]), dtype=each.dtype, device=device) for each in like]
         self._graph: torch.cuda.CUDAGraph | None = None
         self._outputs: tuple[Tensor, ...] = ()
         # Waiting for a blocking event leaves the core to the other processes of `serve`; copying to the CPU would spin.
         self._done = torch.Event(device, blocking=True) if device.type == "cuda" else None
-
-    def capture(self, pool: Any) -> None:
-        """Capture the network as a graph; what it makes once, such as places, is made before."""
-        for _ in range(2):
-            self._network(*self._inputs)
-        self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph, pool=pool):
-            self._outputs = self._network(*self._inputs)
+        if pool is not None:
+            for _ in range(2):  # what the network makes once, such as places, is made before
+                network(*self._inputs)
+            self._graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(self._graph, pool=pool):
+                self._outputs = network(*self._inputs)
 
     def run(self, inputs: Sequence[Tensor], streams: int) -> tuple[Array, ...]:
         """Return the outputs (streams, ...) of inputs (streams, ...) or (1, ...)."""

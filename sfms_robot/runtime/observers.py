@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
-from sfms_robot.frames import Plan, SpeakerFrame
+from sfms_robot.frames import NO_SOUND, Plan, SpeakerFrame
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.states import RUNNING, RunState
 from sfms_robot.signals.audio import energy_db
@@ -77,12 +77,12 @@ class RunStatus(Observer):
         self,
         joints: Sequence[str],
         facts: Mapping[str, Any],
-        figures: Callable[[], Mapping[str, Any]] | None = None,
+        figures: Callable[[], Mapping[str, Any]] = dict,
     ) -> None:
         self._joints, self._facts, self._figures = tuple(joints), dict(facts), figures
         self._tick: Tick | None = None
         self._ended: dict[str, Any] = {}
-        self._frame: SpeakerFrame | None = None
+        self._frame = SpeakerFrame(0.0, NO_SOUND)
         self._planned_s: float | None = None
 
     def tick(self, seen: Tick) -> None:
@@ -118,13 +118,11 @@ class RunStatus(Observer):
         document["note"] = {**_NOTES, **special}.get(document["state"])
         document["person"] = _person(frame)
         document["planned_s"] = self._planned_s
-        return document | dict(self._figures() if self._figures else {})
+        return document | dict(self._figures())
 
 
-def _person(frame: SpeakerFrame | None) -> dict[str, Any]:
+def _person(frame: SpeakerFrame) -> dict[str, Any]:
     """Return the content of the newest frame: of the person, and of the robot's own voice."""
-    if frame is None:
-        return {"voice_db": None, "seen": False, "attention": None, "own_voice_db": None}
     return {
         "voice_db": round(energy_db(frame.audio), 1) if len(frame.audio) else None,
         "seen": frame.face is not None,

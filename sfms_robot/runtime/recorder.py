@@ -398,7 +398,7 @@ def _by_channel(motion: Floats) -> dict[str, float]:
 
 
 def _rounded(value: Any) -> Any:
-    """Return a number rounded, an array as rounded lists, None as it is.
+    """Return a number rounded, an array as rounded lists, None unchanged.
 
     Values that are not finite become null on disk: JSON has no inf and no NaN.
     """

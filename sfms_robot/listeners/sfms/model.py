@@ -249,13 +249,11 @@ class Decode(Network[SfmsModel]):
     """Tokens as motion."""
 
     free = ("rows", "seen")
+    further = Around._fields
 
-    def forward(
-        self, tokens: Tensor, before: Tensor, after: Tensor, rows: Tensor, seen: Tensor, places: Tensor
-    ) -> tuple[Tensor]:
+    def forward(self, tokens: Tensor, *around: Tensor) -> tuple[Tensor]:
         """Return standardised motion (B, 2 + H, C), from the frame before now, of tokens (B, P + H, G) and `Around`."""
-        found = Around(before, after, rows, seen, places)
-        return (self.model.tokenizer.decode(tokens, last=self.model.settings.future_frames + 2, around=found),)
+        return (self.model.tokenizer.decode(tokens, self.model.settings.future_frames + 2, Around(*around)),)
 
 
 @torch.no_grad()

@@ -151,16 +151,6 @@ class Segments(NamedTuple):
     before: Tensor
     after: Tensor
 
-    def bounded(self, max_gap: int) -> Segments:
-        """Return these without stretches of more than `max_gap` frames, also to both ends."""
-        t = self.before.shape[-1]
-        frame = torch.arange(t, device=self.before.device)
-        return Segments(
-            self.inside.masked_fill(frame[None, :] - frame[:, None] > max_gap, torch.inf),
-            self.before.masked_fill(frame > max_gap, torch.inf),
-            self.after.masked_fill(t - 1 - frame > max_gap, torch.inf),
-        )
-
     def through(self, chosen: Tensor) -> Segments:
         """Return these without stretches that pass over any of the `chosen` frames (N, T)."""
         seen = chosen.cumsum(-1)  # chosen frames up to and including t
@@ -173,14 +163,17 @@ class Segments(NamedTuple):
         )
 
 
-def segments(x: Tensor) -> Segments:
-    """Return the errors of every stretch of tracks x (N, T, c), straight lines all the way."""
-    t = x.shape[1]
-    before, band, after = stretches(x, t)
-    frame = torch.arange(t, device=x.device)
+def segments(x: Tensor, max_gap: int | None = None) -> Segments:
+    """Return the errors of every stretch of tracks x (N, T, c), straight lines all the way.
+
+    `max_gap`: frames of the longest stretch, also to both ends; None for no bound.
+    """
+    most = x.shape[1] if max_gap is None else max_gap
+    before, band, after = stretches(x, most)
+    frame = torch.arange(x.shape[1], device=x.device)
     gap = frame - frame[:, None]  # j - i
-    inside = band[:, frame, gap.clamp(min=0)]  # [i, j] = band[j, j - i]
-    return Segments(inside.masked_fill(gap <= 0, torch.inf), before, after)
+    inside = band[:, frame, gap.clamp(0, most)]  # [i, j] = band[j, j - i]
+    return Segments(inside.masked_fill((gap <= 0) | (gap > most), torch.inf), before, after)
 
 
 def best_frames(cost: Segments, count: int) -> Tensor:

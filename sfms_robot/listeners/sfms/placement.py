@@ -17,12 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sfms_robot.config.listener import Placement
 from sfms_robot.listeners.layers import Block, places_of
 from sfms_robot.listeners.sfms.piecewise_linear import (
     Neighbours,
@@ -34,7 +34,7 @@ from sfms_robot.listeners.sfms.piecewise_linear import (
     segments,
 )
 
-Strategy = Literal["exact", "penalised", "static", "static_paper", "learned_paper", "adaptive", "learned"]
+Strategy = Placement
 EPSILON = 1e-20  # of Algorithm 1, line 9: a chosen frame falls by 46, more than any two scores differ
 MOST_CURVES = 3  # principal curves of a group that the network sees
 STILL = 1e-3  # root mean square, standardised, below which motion counts as noise
@@ -239,8 +239,7 @@ def place_exact(motion: Tensor, k: Sequence[int], member: Tensor, max_gap: int |
     mask = motion.new_zeros(b, t, len(k))
     for group, count in enumerate(k):  # one at a time: the tables of one group fit the processor's cache
         _check(count, t, max_gap)
-        cost = segments(motion[..., member[group] > 0.5])
-        frames = best_frames(cost if max_gap is None else cost.bounded(max_gap), count)
+        frames = best_frames(segments(motion[..., member[group] > 0.5], max_gap), count)
         mask[:, :, group] = mask[:, :, group].scatter(1, frames, 1.0)
     return mask
 
