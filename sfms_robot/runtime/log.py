@@ -177,28 +177,11 @@ class RunLog:
     def planned(self, plan: Plan) -> None:
         self._waiting.append(plan)
 
-    def commanded(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles, motion: Floats) -> None:
-        """Record the goals (J,) of the limiter for a reference (J,), sent or not, and the face (58,) behind it."""
-        self.listened_s = tick.time_s
-        self._tick(tick, goals_rad, asked_rad)
-        for name, kind in MOTION_EVENTS.items():
-            self._counters[name].add(float(kind.signal(motion)))
+    def commanded(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles, motion: Floats | None = None) -> None:
+        """Record the goals (J,) of the limiter for a reference (J,), sent or not.
 
-    def wrote(self, wire_s: float, reach_s: float) -> None:
-        """Record a command on the wire at `wire_s`, which played the timeline up to `reach_s`."""
-        while self._waiting and self._waiting[0].times_s[0] <= reach_s:
-            made_at_s = self._waiting.popleft().made_at_s
-            self.frame_to_wire_ms.add(max(0.0, wire_s - made_at_s) * 1e3)
-            while self._speech_s and self._speech_s[0] <= made_at_s:
-                first_sample_s = self._speech_s.popleft() - FRAME_S
-                self.speech_to_wire_ms.add(max(0.0, wire_s - first_sample_s) * 1e3)
-
-    def ease(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles) -> None:
-        """Record one tick of the way to rest."""
-        self._tick(tick, goals_rad, asked_rad)
-        self.eased += 1
-
-    def _tick(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles) -> None:
+        `motion`: the face (58,) behind it; None on the way to rest.
+        """
         late_s = tick.late_s + tick.skipped * self.period_s
         self.ticks += 1
         self.late += late_s > LATE_SHARE * self.period_s
@@ -212,6 +195,21 @@ class RunLog:
         if self._last_rad is not None:
             self._travel_rad = self._travel_rad + np.abs(goals_rad - self._last_rad)
         self._last_rad = goals_rad
+        if motion is None:
+            self.eased += 1
+            return
+        self.listened_s = tick.time_s
+        for name, kind in MOTION_EVENTS.items():
+            self._counters[name].add(float(kind.signal(motion)))
+
+    def wrote(self, wire_s: float, reach_s: float) -> None:
+        """Record a command on the wire at `wire_s`, which played the timeline up to `reach_s`."""
+        while self._waiting and self._waiting[0].times_s[0] <= reach_s:
+            made_at_s = self._waiting.popleft().made_at_s
+            self.frame_to_wire_ms.add(max(0.0, wire_s - made_at_s) * 1e3)
+            while self._speech_s and self._speech_s[0] <= made_at_s:
+                first_sample_s = self._speech_s.popleft() - FRAME_S
+                self.speech_to_wire_ms.add(max(0.0, wire_s - first_sample_s) * 1e3)
 
     def attention_report(self) -> dict[str, float | int | None]:
         """Return `attention` of the report: share of the judged frames in which the person looks at the head."""

@@ -72,7 +72,7 @@ def come_to_rest(
         arrived = False
         try:
             goals_rad, state = limiter.step(reference, state)
-            log.ease(tick, goals_rad, reference[0])
+            log.commanded(tick, goals_rad, reference[0])
             bus.write(goals_rad, tick.time_s)
             readings, failed = bus.poll(tick.time_s), 0
             seen(tick.time_s, 1.0 - angle, goals_rad, readings)
