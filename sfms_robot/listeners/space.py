@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from sfms_robot import config
-from sfms_robot.frames import MOTION_DIM, SPACE_CHANNELS, Doubles, Floats
+from sfms_robot.frames import FRAME_S, MOTION_DIM, SPACE_CHANNELS, Doubles, Floats, Plan
 from sfms_robot.signals import spaces
 from sfms_robot.signals.spaces import FlameMatrix, read_matrix
 
@@ -56,6 +56,11 @@ class MotionSpace:
         return spaces.decode(
             frames, self.name, neutral=self.neutral, metres_per_unit=self.metres_per_unit, flame=self.flame
         )
+
+    def plan(self, made_at_s: float, frames: Floats) -> Plan:
+        """Return frames (H, D) as the plan that follows a speaker's frame which ended at `made_at_s`."""
+        motion, jaw_rad = self.decode(frames)
+        return Plan(made_at_s, np.add(made_at_s, FRAME_S * np.arange(1, 1 + len(frames))), motion, jaw_rad)
 
     def encode(self, motion: Floats) -> Floats:
         """Return our motion (N, 58) in the space (N, D). deca56 takes pose and jaw; its expression stays at rest."""

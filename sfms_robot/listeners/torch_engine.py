@@ -36,7 +36,6 @@ from sfms_robot.listeners.layers import Network
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.model import networks as sfms_networks
 from sfms_robot.listeners.sfms.stream import SfmsListener
-from sfms_robot.signals.control import COLUMNS
 
 Networks = Mapping[str, Network[Any]]  # by name
 
@@ -232,10 +231,10 @@ def export(
         listener = ArigListener(model.settings, recorder, folder)
     else:
         listener = SfmsListener(model.settings, recorder, folder)
-    control = [np.zeros((sum(listener.control_frames), len(COLUMNS)), np.float32)] if settings.events else [None]
+    control = np.zeros((sum(listener.control_frames), listener.control_columns), np.float32)
     speakers = [SpeakerFrame(FRAME_S, SILENCE) for _ in range(EXAMPLE_STREAMS)]
     memories: list[Any] = [listener.start(seed) for seed in range(EXAMPLE_STREAMS)]
-    listener.step_each(speakers, memories, control * EXAMPLE_STREAMS)
+    listener.step_each(speakers, memories, [control] * EXAMPLE_STREAMS)
     models: dict[str, SfmsModel | ArigModel] = {"": model}
     if int8 and isinstance(model, ArigModel) and large_layers(model):
         models[".int8"] = in_integers(model)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from sfms_robot import config
 from sfms_robot.config.listener import EVENT_STATES, STATES
 from sfms_robot.errors import ModelError
-from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats, Plan, SpeakerFrame, changed
+from sfms_robot.frames import Bools, Doubles, Floats, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.audio_frontend import TRACKS, AudioState, fit_frame, hear_each
 from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HeadSway
@@ -256,12 +256,11 @@ class ArigListener(RunsOnEngine):
         sojourns, states = self._states(logits, now, rows, voiced)
         out: list[tuple[Plan | None, ArigMemory]] = []
         for index, (speaker, memory) in enumerate(zip(speakers, now, strict=True)):
-            frames, jaw_rad = self.space.decode(shown[index])
-            plan = Plan(speaker.time_s, np.array([speaker.time_s + FRAME_S]), frames, jaw_rad)
             own: dict[str, Any] = dict(zip(_MADE, (part[index] for part in (*kept, *drawn)), strict=True))
             if memory.frames % settings.chunk_frames == 0:  # the chunk is whole: its keys and values stay (3.2)
                 own["context"] = np.concatenate([memory.context[:, :, 1:], summaries[index][:, :, None]], axis=2)
-            out.append((plan, changed(memory, **own, state=states[index], sojourn=sojourns[index])))
+            after = changed(memory, **own, state=states[index], sojourn=sojourns[index])
+            out.append((self.space.plan(speaker.time_s, shown[index]), after))
         return out
 
     def _states(

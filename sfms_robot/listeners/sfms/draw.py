@@ -315,14 +315,10 @@ def smile_course(smile: SmileCourse, control: Floats) -> Course:
     since = since_s(control[..., _AT["smile.since"]])
     over = control[..., _AT["smile.over"]].astype(np.float64)  # the share of its duration that has passed
     left = np.where(over > 0, since * (1 / np.maximum(over, 1e-6) - 1), np.inf)
-    wanted = np.where(told, control[..., _AT["smile.size"]] * smile_share(smile, since, left), np.nan)
+    # Of its size a smile has as much as it has risen, and no more than is left of its fall.
+    share = np.minimum(np.interp(since, smile.RISE_S, smile.rise), np.interp(left, smile.FALL_S, smile.fall))
+    wanted = np.where(told, control[..., _AT["smile.size"]] * share, np.nan)
     return Course(wanted, np.full_like(wanted, smile.spread))
-
-
-def smile_share(smile: SmileCourse, since: Doubles, left: Doubles) -> Doubles:
-    """Return the share of its size that a smile has `since` its beginning, with `left` to its end, both in seconds."""
-    rise = np.interp(since, smile.RISE_S, smile.rise)
-    return np.minimum(rise, np.interp(left, smile.FALL_S, smile.fall))
 
 
 def nod_course(nod: NodCourse, control: Floats) -> Course:

@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 from sfms_robot import config
 from sfms_robot.frames import (
     CHANNEL_INDEX,
-    FRAME_S,
     MOTION_DIM,
     SMILE_CORNERS,
     Bools,
@@ -240,16 +239,11 @@ class SfmsListener(RunsOnEngine):
         tokens, path = self.plan(inputs, settled, way, [memory.seed for memory in memories], newest)
         # 5. The path becomes motion: the head smoothed, its slow sway added, in our motion space.
         sway = stacked([memory.sway for memory in memories])
-        motion, jaw_rad = self.space.decode(
-            self.with_sway(self.shown(path), sway, np.array(newest) + 1).reshape(-1, path.shape[-1])
-        )
-        ahead_s: Doubles = FRAME_S * np.arange(1, self.horizon + 1, dtype=np.float64)
+        motion = self.with_sway(self.shown(path), sway, np.array(newest) + 1)
         found = []
         for row, (at_s, memory) in enumerate(zip(times_s, memories, strict=True)):
-            own = slice(row * self.horizon, (row + 1) * self.horizon)
-            plan = Plan(at_s, np.add(at_s, ahead_s), motion[own], None if jaw_rad is None else jaw_rad[own])
             after = changed(memory, speaker=speakers[row], tokens=tokens[row], control=control[row], path=path[row])
-            found.append((plan, after))
+            found.append((self.space.plan(at_s, motion[row]), after))
         return found
 
     def with_sway(self, shown: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:

@@ -202,8 +202,7 @@ def test_a_code_may_follow_itself_class_0_anything_and_without_bounds_every_code
 def test_allowed_codes_are_exactly_those_no_channel_has_to_hurry_for():
     model, reach = listener_with_speed(0.1)
     quantizer = model.tokenizer.quantizer
-    codes = quantizer.codebook.codes(torch.arange(6)[:, None].expand(6, 2))
-    neck = quantizer.decode(codes[None])[0, :, :6].detach()
+    neck = quantizer.decode(quantizer.codebook.codes(torch.arange(6)[:, None].expand(6, 2))[None])[0, :, :6].detach()
     for gap in (1, 5, 20):
         allowed = ~reach.too_soon(np.array([[3, 0]]), np.array([[gap, gap]]))[0, 0, 1:7]
         np.testing.assert_array_equal(allowed, ((neck - neck[2]).abs() <= 0.1 * gap).all(-1))
