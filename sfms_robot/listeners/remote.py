@@ -261,8 +261,6 @@ class RemoteListener:
             if key not in self._shown:
                 self._shown.append(key)
                 fresh.append(event)
-        if len(fresh) == len(plan.events):
-            return plan
         return replace(plan, events=tuple(fresh))
 
 

@@ -115,8 +115,7 @@ def test_plans_wait_for_late_ones_also_of_a_stream_that_was_joined_before_the_lo
     head = robot(Network(0.05, 0.02), horizon=1, hop=1)
     head.link.ask = lambda message: head.link.arrived(head.server.core.join(message, head.server.now_s()))
     head.feed.wait_loaded(1.0)
-    assert not head.feed.lost
-    assert figures(head.run(4.0))["link"]["buffer_ms"] > 60
+    assert not head.feed.lost and figures(head.run(4.0))["link"]["buffer_ms"] > 60
 
 
 def asking(head):
