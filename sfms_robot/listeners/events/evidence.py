@@ -412,18 +412,17 @@ def looks_at_head(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, Se
     """Return 1, 0 or NaN (unknown), and the memory after it."""
     if memory.addressed != "sense":
         return float(memory.addressed == "assume"), memory
-    if speaker.face is None and speaker.attention is None:
-        unseen = None if memory.unseen is None else memory.unseen + 1
-        if unseen is None:
-            return 1.0, memory
-        lost = unseen > LOST_FRAMES
-        gone = changed(memory, unseen=unseen, attention=None if lost else memory.attention,
-                       looked=math.nan if lost else memory.looked)  # fmt: skip
-        return gone.looked, gone
     given = speaker.attention
+    if speaker.face is None and given is None:
+        if memory.unseen is None:
+            return 1.0, memory
+        unseen = memory.unseen + 1
+        lost = {"attention": None, "looked": math.nan} if unseen > LOST_FRAMES else {}
+        gone = changed(memory, unseen=unseen, **lost)
+        return gone.looked, gone
+    if given is None and not memory.tells:
+        return 1.0, changed(memory, unseen=0)
     if given is None or not math.isfinite(given):
-        if given is None and not memory.tells:
-            return 1.0, changed(memory, unseen=0)
         return math.nan, changed(memory, unseen=0, attention=None, looked=math.nan)
     before = 1.0 if memory.attention is None else memory.attention
     given = min(max(given, 0.0), 1.0)

@@ -273,10 +273,13 @@ class EventModel:
         rows = [row for row, one in enumerate(sensed) if one.frame % STEP_FRAMES == STEP_FRAMES - 1]
         if rows:
             known = [memory.done for memory in memories]
+            ends_s = [(one.frame + 1) * FRAME_S for one in sensed]
             if histories is not None:
-                ends_s = [(one.frame + 1) * FRAME_S for one in sensed]
                 known = [tuple(begun_before(*each)) for each in zip(histories, ends_s, strict=True)]
-            evidence = np.array([self._evidence(sensed[row], known[row], memories[row].calmness) for row in rows])
+            learned = self.tables.hazards["nod"].per_minute
+            rates = [math.log(memory.calmness.nod or learned) for memory in memories]
+            did = [done(known[row], ends_s[row], rates[row]) for row in rows]
+            evidence = np.concatenate([[sensed[row].heard for row in rows], did], axis=1)
             terms = self.bank.contributions(evidence)
             for row, odds, own in zip(rows, self.bank.log_odds(terms), terms, strict=True):
                 found[row] = self._drawn(sensed[row], memories[row], known[row], odds, own)
@@ -308,11 +311,6 @@ class EventModel:
                 )
         kept = remembered((*memory.done, *events), now_s) if events else memory.done
         return tuple(events), changed(memory, done=kept, hazards_hz=hazards)
-
-    def _evidence(self, sensed: Sensed, history: Sequence[ListenerEvent], calmness: Calmness) -> Doubles:
-        """Return the evidence (len(EVIDENCE),) of a frame and of events before it."""
-        nods = calmness.nod or self.tables.hazards["nod"].per_minute
-        return np.concatenate([sensed.heard, done(history, (sensed.frame + 1) * FRAME_S, math.log(nods))])
 
     def _asked_odds(self, calmness: Calmness) -> list[float]:
         """Return what requested rates add to the log-odds of each kind without `log_rate` among its evidence."""
