@@ -16,12 +16,11 @@ replaced by a shorter one, never by a longer one, so that it settles.
 
     parent -> child     (name, seed, calmness, engine), then SpeakerFrame after SpeakerFrame; between them an
                         int: the hop, which it waits for and which may change; at any time another Calmness
-    child -> parent     (kind, value, number)
+    child -> parent     (kind, value)
         loaded          it can be loaded; value names its engine
         probed          value is a `Probe`; it waits for its hop
         ready           it listens
-        done, plan      a frame was taken; for a plan, value is the answer and number the ms that it took
-        skipped         number frames were left out
+        step            a frame was taken: value is a `thread.Stepped`
         error           it cannot listen, and value says why
 """
 
@@ -42,7 +41,7 @@ from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, SILENCE, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.thread import CLOSE_LIMIT_S, MOST_WAITING, Inbox, Lateness, listen
+from sfms_robot.listeners.thread import CLOSE_LIMIT_S, MOST_WAITING, Inbox, Lateness, Stepped, listen
 from sfms_robot.ports import Listener
 from sfms_robot.processes import LIMITS, START_LIMIT_S, Child, Ended, ParentPipe, Supervised, cores, give_way
 from sfms_robot.signals.quantiles import Quantiles
@@ -192,7 +191,7 @@ class ListenerProcess:
         if isinstance(message, Ended):
             self._failure = f"the listener process died (exit code {message.code})"
             return None
-        kind, value, number = message
+        kind, value = message
         if kind == "error":
             self._failure = value
         elif kind == "loaded":
@@ -204,23 +203,18 @@ class ListenerProcess:
         elif kind == "ready":
             self._supervised.enter("running")
             self._review_s = now_s + REVIEW_S
-        elif kind == "skipped":
-            if not self._skipped:
-                log.warning("the listener is slower than the person: it leaves frames out to keep up")
-            self._skipped += int(number)
-            self._count_answers(int(number))
         else:
-            self._count_answers(1)
-            if kind == "plan":
-                plan: Plan = value
-                self._step_ms.add(number)
-                self._lateness.came(plan, now_s)
-                return plan
+            answer: Stepped = value
+            if answer.left_out and not self._skipped:
+                log.warning("the listener is slower than the person: it leaves frames out to keep up")
+            self._skipped += answer.left_out
+            self._unanswered = max(0, self._unanswered - 1 - answer.left_out)
+            self._answered = True
+            if answer.plan is not None:
+                self._step_ms.add(answer.taken_ms)
+                self._lateness.came(answer.plan, now_s)
+            return answer.plan
         return None
-
-    def _count_answers(self, frames: int) -> None:
-        self._unanswered = max(0, self._unanswered - frames)
-        self._answered = True
 
     def _check(self, now_s: float) -> None:
         if self._probe is not None:
@@ -291,16 +285,16 @@ def main() -> None:
         from sfms_robot.listeners.registry import at_hop, engine_name, hops_of, load_listener
 
         listener = load_listener(name, calmness=calmness, engine=engine, threads=1)
-        parent.send(("loaded", engine_name(listener), 0.0))
+        parent.send(("loaded", engine_name(listener)))
         hops = hops_of(listener)
         quickest = at_hop(listener, min(hops))
         if use_threads(quickest, threads()):
-            parent.send(("loaded", engine_name(listener), 0.0))
+            parent.send(("loaded", engine_name(listener)))
         p50_s, p99_s = plan_times_s(quickest)
         probe = Probe(horizon=listener.horizon, hop=listener.hop, hops=hops, step_p50_s=p50_s, step_p99_s=p99_s)
-        parent.send(("probed", probe, 0.0))
+        parent.send(("probed", probe))
     except RobotError as error:
-        parent.send(("error", str(error), 0.0))
+        parent.send(("error", str(error)))
         return
     while inbox.hop is None:  # awake again and again: for the parent, a child that uses no processor time hangs
         time.sleep(AWAKE_S)

@@ -208,17 +208,17 @@ class StreamServer:
             if (reason := self._full()) is not None:
                 return Refusal(reason, final=False)
             memory = self._listener.start(join.seed)
-            known = _Stream(name=secrets.token_hex(6), client=join.client, memory=memory, heard_s=now_s)
-            known.calmness = calmness
+            known = _Stream(
+                name=secrets.token_hex(6), client=join.client, memory=memory, heard_s=now_s, calmness=calmness
+            )
             self._streams[known.name] = known
         known.heard_s = now_s
-        listener = self._listener
         return Welcome(
             stream=known.name,
             server=self._server,
             listener=self._name,
-            horizon=listener.horizon,
-            hop=listener.hop,
+            horizon=self._listener.horizon,
+            hop=self._listener.hop,
         )
 
     def _full(self) -> str | None:
@@ -250,51 +250,42 @@ class StreamServer:
             return [words_message(Notice("unknown"))]
         stream.heard_s = now_s
         try:
-            if message[:1] == b"{":
-                self._heed(stream, message)
-                return []
-            return self._enqueue(stream, parse_frame(message), now_s)
+            if message[:1] != b"{":
+                return self._enqueue(stream, parse_frame(message), now_s)
+            said = parse_words(message)
+            if not isinstance(said, Notice):
+                raise PacketError("a stream: expected a notice (leave, calm)")
+            if said.kind == "leave":
+                del self._streams[name]
+            elif said.kind == "calm" and said.calmness is not None:
+                stream.calmness = parse(Calmness, dict(said.calmness), "calmness")
         except RobotError as error:
             self._count_malformed(f"stream {name} of {stream.client!r}", error)
-            return []
+        return []
 
     def _count_malformed(self, origin: str, error: RobotError) -> None:
         self.counts["malformed"] += 1
         if self.counts["malformed"] == 1:
             log.warning("%s: %s (more malformed messages are only counted)", origin, error)
 
-    def _heed(self, stream: _Stream, message: bytes) -> None:
-        said = parse_words(message)
-        if not isinstance(said, Notice):
-            raise PacketError("a stream: expected a notice (leave, calm)")
-        if said.kind == "leave":
-            self._streams.pop(stream.name, None)
-        elif said.kind == "calm" and said.calmness is not None:
-            stream.calmness = parse(Calmness, dict(said.calmness), "calmness")
-
     def _enqueue(self, stream: _Stream, sent: SentFrame, now_s: float) -> Sequence[bytes]:
-        if stream.expected is not None:
-            gap = sent.number - stream.expected
-            if gap < 0:
-                return []  # it came late, and an empty one has taken its place; or twice
-            self.counts["lost_frames"] += gap
-            for back in range(min(gap, MOST_FILLED), 0, -1):
-                empty = SpeakerFrame(sent.frame.time_s - back * FRAME_S, NO_SOUND)
-                filled = SentFrame(sent.number - back, empty, sent.sent_s - back * FRAME_S, sent.server_sent_s)
-                stream.waiting.append(self._due(filled, now_s))
+        gap = 0 if stream.expected is None else sent.number - stream.expected
+        if gap < 0:
+            return []  # it came late, and an empty one has taken its place; or twice
+        self.counts["lost_frames"] += gap
         stream.expected = sent.number + 1
-        stream.waiting.append(self._due(sent, now_s))
+        made_s = sent.server_sent_s if 0.0 <= now_s - sent.server_sent_s <= _STALE_S else now_s
+        for back in range(min(gap, MOST_FILLED), -1, -1):
+            ago_s = back * FRAME_S
+            frame = SpeakerFrame(sent.frame.time_s - ago_s, NO_SOUND) if back else sent.frame
+            own = SentFrame(sent.number - back, frame, sent.sent_s - ago_s, sent.server_sent_s)
+            stream.waiting.append(_Due(own, now_s, made_s + DEADLINE_S))
         if len(stream.waiting) <= MOST_WAITING:
             return []
         left_out = len(stream.waiting) - 1
         stream.waiting = deque([stream.waiting[-1]])
         self.counts["skipped_frames"] += left_out
         return [words_message(Notice("skipped", frames=left_out))]
-
-    def _due(self, sent: SentFrame, now_s: float) -> _Due:
-        age_s = now_s - sent.server_sent_s
-        made_s = sent.server_sent_s if 0.0 <= age_s <= _STALE_S else now_s
-        return _Due(sent, now_s, made_s + DEADLINE_S)
 
     # --- batches -----------------------------------------------------------------------------------------------------
 

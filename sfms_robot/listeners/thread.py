@@ -12,7 +12,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from sfms_robot.config.listener import Calmness
 from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
@@ -27,7 +27,7 @@ USUAL_S: Final = 0.1  # from the end of a frame until a microphone's sound is th
 MOST_WAITING: Final = FRAME_HZ // 2  # frames
 CATCH_UP: Final = 0.5  # frames by which fewer must wait after each, while it catches up: twice the person's pace
 
-Say = Callable[[tuple[str, Any, float]], object]
+Say = Callable[[tuple[str, Any]], object]
 
 log = logging.getLogger(__name__)
 
@@ -79,23 +79,28 @@ def calmed(listener: Listener, memory: Any, calmness: Calmness | None) -> Any:
     return memory if calmness is None or change is None else change(memory, calmness)
 
 
+class Stepped(NamedTuple):
+    """The answer to a frame: a plan where one is due, what it took, and the number of frames left out before it."""
+
+    plan: Plan | None
+    taken_ms: float
+    left_out: int
+
+
 def listen(listener: Listener, seed: int, inbox: Inbox, say: Say) -> None:
-    """Step once per frame until None comes; report readiness, each answer, and the frames that were left out."""
+    """Step once per frame until None comes; report readiness, and each `Stepped`."""
     from sfms_robot.listeners.registry import at_hop
 
     memory = listener.start(seed)
-    say(("ready", None, 0.0))
+    say(("ready", None))
     while (frame := inbox.next()) is not None:
-        if inbox.skipped:
-            say(("skipped", None, inbox.skipped))
         calmness, inbox.calmness = inbox.calmness, None
         memory = calmed(listener, memory, calmness)
         if inbox.hop is not None:
             listener = at_hop(listener, inbox.hop)
         began_s = time.perf_counter()
         plan, memory = listener.step(frame, memory)
-        taken_ms = (time.perf_counter() - began_s) * 1e3
-        say(("done" if plan is None else "plan", plan, taken_ms))
+        say(("step", Stepped(plan, (time.perf_counter() - began_s) * 1e3, inbox.skipped)))
 
 
 class Lateness:
@@ -146,7 +151,7 @@ class ListenerThread:
     def __init__(self, listener: Listener, seed: int) -> None:
         self._listener, self._seed = listener, seed
         self._inbox = Inbox()
-        self._said: queue.SimpleQueue[tuple[str, Any, float]] = queue.SimpleQueue()
+        self._said: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
         self._step_ms = Quantiles()
         self._lateness = Lateness()
         self._unanswered = self._skipped = 0  # frames
@@ -174,19 +179,18 @@ class ListenerThread:
         """Return plans that came. Never blocks."""
         plans = []
         while not self._said.empty():
-            kind, value, number = self._said.get_nowait()
+            kind, value = self._said.get_nowait()
             self._since_s = now_s
             if kind == "error":
                 self._state = value
-            elif kind == "skipped":
-                self._skipped += int(number)
-                self._unanswered -= int(number)
-            elif kind != "ready":
-                self._unanswered -= 1
-            if kind == "plan":
-                self._step_ms.add(number)
-                self._lateness.came(value, now_s)
-                plans.append(value)
+            elif kind == "step":
+                plan, taken_ms, left_out = value
+                self._skipped += left_out
+                self._unanswered -= 1 + left_out
+                if plan is not None:
+                    self._step_ms.add(taken_ms)
+                    self._lateness.came(plan, now_s)
+                    plans.append(plan)
         if not self._unanswered:
             self._since_s = now_s
         silent_s = now_s - self._since_s
@@ -222,5 +226,5 @@ class ListenerThread:
         try:
             listen(self._listener, self._seed, self._inbox, self._said.put)
         except Exception as error:
-            self._said.put(("error", f"failed: {type(error).__name__}: {error}", 0.0))
+            self._said.put(("error", f"failed: {type(error).__name__}: {error}"))
             log.exception("the listener failed; the run continues without it")
