@@ -57,7 +57,7 @@ YAW_PITCH: Final = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
 BLINKS: Final = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
 SMILE_CORNERS: Final = ("mouthSmileLeft", "mouthSmileRight")  # of the mouth: what tells a smile
 
-# Columns of each motion space a listener may work in (`signals.spaces`); arkit58 is a motion array itself.
+# Columns of each motion space a listener may work in (`listeners.space`); arkit58 is a motion array itself.
 _AXES: Final = ("x", "y", "z")
 SPACE_CHANNELS: Final[Mapping[str, tuple[str, ...]]] = {
     "arkit58": CHANNELS,
@@ -96,30 +96,6 @@ ORDERS: Final[Mapping[str, tuple[str, ...]]] = {
     "live_link_csv": tuple(_SWAPPED.get(name, name) for name in _APPLE),
     "mediapipe": ("_neutral", *BLENDSHAPES[:-1]),
 }
-
-
-# Of every order: its columns that are blendshapes, and where these stand among ours.
-_PLACES: Final[Mapping[str, tuple[list[int], list[int]]]] = {
-    order: (
-        [column for column, name in enumerate(names) if name != "_neutral"],
-        [BLENDSHAPES.index(name) for name in names if name != "_neutral"],
-    )
-    for order, names in ORDERS.items()
-}
-
-
-def reorder(values: NDArray[np.floating], order: str) -> Floats:
-    """Blendshapes (..., n) in the named outside order -> (..., 52) alphabetical; missing ones are 0.
-
-    Raises KeyError for an unknown order and ValueError for a wrong last dimension.
-    """
-    names = ORDERS[order]
-    if values.shape[-1] != len(names):
-        raise ValueError(f"order {order!r} has {len(names)} channels, got {values.shape[-1]}")
-    out = np.zeros((*values.shape[:-1], len(BLENDSHAPES)), dtype=np.float32)
-    columns, places = _PLACES[order]
-    out[..., places] = values[..., columns]
-    return out
 
 
 def changed(value: Value, **fields: object) -> Value:

@@ -1,16 +1,86 @@
-"""The motion space of a listener, as its models and streams use it: our motion in, our motion out."""
+"""The motion spaces that listener papers work in: their table, the way from them to ours, and back.
+
+`faceverse58`: 52 expression | 3 rotation, Euler x, y, z with R = Rz Ry Rx | 3 translation. Its neutral is about
+(pi, 0, 0), so every rotation is taken against the neutral one.
+`deca56`: 50 FLAME expression | 3 head axis-angle | 3 jaw axis-angle. FLAME's expression is not ARKit's: it takes a
+matrix that maps one to the other, which no licence lets us ship. Without it pose and jaw move and nothing else.
+`arkit58`: our own motion.
+
+A rotation R of a space turns our head by A R A^T, where A takes the space's axes to ours (x forward, y left, z up).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 from sfms_robot import config
-from sfms_robot.frames import FRAME_S, MOTION_DIM, SPACE_CHANNELS, Doubles, Floats, Plan
-from sfms_robot.signals import spaces
-from sfms_robot.signals.spaces import FlameMatrix, read_matrix
+from sfms_robot.errors import ConfigError
+from sfms_robot.frames import (
+    BLENDSHAPES,
+    FRAME_S,
+    JAW_FULL_OPEN_RAD,
+    MOTION_DIM,
+    ORDERS,
+    POSE,
+    SHAPES,
+    SPACE_CHANNELS,
+    Doubles,
+    Floats,
+    Plan,
+)
+from sfms_robot.signals.rotations import angles_of, from_vector, rotation
+from sfms_robot.signals.spaces import bounded_least_squares
+
+
+@dataclass(frozen=True, kw_only=True)
+class Space:
+    """One motion space; rotations in radians, translation without a metric scale.
+
+    Attributes:
+        expression, rotation: places of their numbers in a frame; `translation` and `jaw` where there are any.
+        euler: the rotation is three angles about the fixed axes x, y, z; otherwise it is axis-angle.
+        axes: A (3, 3), rows are our x, y, z in the space's axes.
+        neutral: rotation of a face that looks straight ahead, as the space writes it.
+    """
+
+    expression: slice
+    rotation: slice
+    translation: slice | None = None
+    jaw: slice | None = None
+    euler: bool = False
+    axes: tuple[tuple[int, int, int], ...]
+    neutral: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def matrices(self, rotations: Doubles) -> Doubles:
+        """Return matrices (N, 3, 3) of rotations (N, 3) as the space writes them."""
+        return rotation(rotations) if self.euler else from_vector(rotations)
+
+
+# The axes of both are unproved and may have to be flipped.
+# FaceVerse: camera frame x to the viewer's right, y down, z away from the viewer (LizhenWangT/FaceVerse @ a012b634:
+# row vectors times R transposed; that the neutral is Rx(pi) follows). FLAME: x to the head's left, y up, z forward.
+SPACES: Final[Mapping[str, Space]] = {
+    "faceverse58": Space(
+        expression=slice(0, 52),
+        rotation=slice(52, 55),
+        translation=slice(55, 58),
+        euler=True,
+        axes=((0, 0, -1), (1, 0, 0), (0, -1, 0)),
+        neutral=(np.pi, 0.0, 0.0),
+    ),
+    "deca56": Space(
+        expression=slice(0, 50),
+        rotation=slice(50, 53),
+        jaw=slice(53, 56),
+        axes=((0, 0, 1), (1, 0, 0), (0, 1, 0)),
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -18,8 +88,9 @@ class MotionSpace:
     """A space by its name, with what a listener's configuration says of it.
 
     Attributes:
-        neutral: (D,) the face at rest in the space.
-        limitation: one line about what cannot be shown, or None.
+        neutral: (D,) the person's face at rest in the space.
+        metres_per_unit: scale of the space's translation; without one the head stays in its place.
+        flame: of `deca56`, from FLAME's expression to ours.
     """
 
     name: str
@@ -36,7 +107,7 @@ class MotionSpace:
         matrix = None
         if settings.flame_matrix is not None and folder is not None:
             matrix = read_matrix(folder / settings.flame_matrix)
-        rest = spaces.rest_of(settings.motion_space) if settings.neutral is None else np.array(settings.neutral)
+        rest = rest_of(settings.motion_space) if settings.neutral is None else np.array(settings.neutral)
         return cls(settings.motion_space, rest, settings.metres_per_unit, matrix)
 
     @property
@@ -45,17 +116,53 @@ class MotionSpace:
 
     @property
     def limitation(self) -> str | None:
-        return spaces.limitation(self.name, self.flame)
+        """Return the limitation of the space in one line, or None."""
+        if self.name != "deca56" or self.flame is not None:
+            return None
+        return f"{self.name} without a matrix drives pose and jaw only: expression is not shown"
 
-    def decode(self, frames: Floats) -> tuple[Floats, Floats | None]:
-        """Return our motion (N, 58) of frames (N, D), and the jaw (N, 3) [rad] where the space has one."""
+    @cached_property
+    def _at_rest(self) -> tuple[Doubles, Doubles]:
+        """Return A (3, 3) of the space, and A times the rotation of the face at rest.
+
+        A head's rotation in the space is A^T R (A times rest), R being ours.
+        """
+        known = SPACES[self.name]
+        axes = np.array(known.axes, dtype=np.float64)
+        return axes, axes @ known.matrices(self.neutral[None, known.rotation])[0]
+
+    def decode(self, frames: Floats | Doubles) -> tuple[Floats, Floats | None]:
+        """Return our motion (N, 58) of frames (N, D), and the jaw (N, 3) [rad] where the space has one.
+
+        The jaw is axis-angle in our axes, + about y lowers the chin. Blendshapes are clipped to 0..1; `limitation` says
+        what cannot be shown. Raises ValueError for frames of another space that are not (N, D) and finite.
+        """
         if self.name == "arkit58":
             shown = np.array(frames, dtype=np.float32)
             np.clip(shown[:, 6:], 0.0, 1.0, out=shown[:, 6:])
             return shown, None
-        return spaces.decode(
-            frames, self.name, neutral=self.neutral, metres_per_unit=self.metres_per_unit, flame=self.flame
-        )
+        values = np.asarray(frames, dtype=np.float64)
+        if values.shape[1:] != (self.dim,):
+            raise ValueError(f"{self.name}: frames are {values.shape}, not (N, {self.dim})")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{self.name}: frame {int(np.argwhere(~np.isfinite(values))[0, 0])} is not finite")
+        known, (axes, upright) = SPACES[self.name], self._at_rest
+        motion = np.zeros((len(values), MOTION_DIM))
+        motion[:, POSE][:, :3] = angles_of(axes @ known.matrices(values[:, known.rotation]) @ upright.T)
+        if known.translation is not None and self.metres_per_unit is not None:
+            moved = values[:, known.translation] - self.neutral[known.translation]
+            motion[:, POSE][:, 3:] = self.metres_per_unit * moved @ axes.T
+
+        expression = values[:, known.expression]
+        if known.jaw is None:  # FaceVerse's is ARKit's, in our order
+            motion[:, SHAPES] = np.minimum(np.maximum(expression, 0.0), 1.0)
+            return motion.astype(np.float32), None
+        jaw_rad = values[:, known.jaw] @ axes.T
+        jaw_open = np.clip(jaw_rad[:, 1] / JAW_FULL_OPEN_RAD, 0.0, 1.0)
+        if self.flame is not None:
+            motion[:, SHAPES] = self.flame.solve(expression, jaw_open)
+        motion[:, SHAPES][:, _JAW] = jaw_open
+        return motion.astype(np.float32), jaw_rad.astype(np.float32)
 
     def plan(self, made_at_s: float, frames: Floats) -> Plan:
         """Return frames (H, D) as the plan that follows a speaker's frame which ended at `made_at_s`."""
@@ -63,9 +170,116 @@ class MotionSpace:
         return Plan(made_at_s, np.add(made_at_s, FRAME_S * np.arange(1, 1 + len(frames))), motion, jaw_rad)
 
     def encode(self, motion: Floats) -> Floats:
-        """Return our motion (N, 58) in the space (N, D). deca56 takes pose and jaw; its expression stays at rest."""
+        """Return our motion (N, 58) in the space (N, D).
+
+        Without `metres_per_unit` the translation stays at rest. deca56 takes pose and jaw, its expression stays at
+        rest: ours cannot be written in it.
+        """
         if motion.shape[-1] != MOTION_DIM:
             raise ValueError(f"motion is {motion.shape}, not (N, {MOTION_DIM})")
         if self.name == "arkit58":
             return motion
-        return spaces.encode(motion, self.name, neutral=self.neutral, metres_per_unit=self.metres_per_unit)
+        known, (axes, upright) = SPACES[self.name], self._at_rest
+        values = np.asarray(motion, dtype=np.float64)
+        whole = axes.T @ rotation(values[:, POSE][:, :3]) @ upright
+        out = np.tile(self.neutral, (len(values), 1))
+        if known.euler:
+            out[:, known.rotation] = angles_of(whole)
+            out[:, known.rotation.start] %= 2 * np.pi  # about pi, not about -pi
+        else:
+            from scipy.spatial.transform import Rotation
+
+            out[:, known.rotation] = Rotation.from_matrix(whole).as_rotvec()
+        if known.translation is not None and self.metres_per_unit is not None:
+            out[:, known.translation] += values[:, POSE][:, 3:] @ axes / self.metres_per_unit
+        if known.jaw is None:
+            out[:, known.expression] = values[:, SHAPES]
+        else:
+            opening = JAW_FULL_OPEN_RAD * values[:, SHAPES][:, _JAW]
+            out[:, known.jaw] += opening[:, None] * axes[1]
+        return out.astype(np.float32)
+
+
+def rest_of(space: str) -> Doubles:
+    """Return a face at rest (D,) that looks straight ahead."""
+    out = np.zeros(len(SPACE_CHANNELS[space]))
+    if space in SPACES:
+        out[SPACES[space].rotation] = SPACES[space].neutral
+    return out
+
+
+# --- FLAME's expression as ARKit blendshapes, with a matrix that the user brings --------------------------------------
+#
+# The matrix has one row of FLAME coefficients per blendshape: weights @ matrix = coefficients. Such matrices are badly
+# conditioned (rows of rare shapes are huge), so it is not inverted: the result is the nearest weights within 0..1, with
+# a small price on their size and on left and right being different. Gaze is not in FLAME's expression: its channels
+# stay 0. The rows of the jaw are not used, because the jaw has a pose.
+
+COEFFICIENTS: Final = 50  # the first ones, those that deca56 has
+_SIZE_PRICE: Final = 0.02  # of the matrix's own scale
+_SIDES_PRICE: Final = 0.05
+_JAW: Final = BLENDSHAPES.index("jawOpen")
+_FIXED_AT_0: Final = [i for i, name in enumerate(BLENDSHAPES) if name.startswith("eyeLook")]
+_SIDES: Final = [
+    (i, BLENDSHAPES.index(name.removesuffix("Left") + "Right"))
+    for i, name in enumerate(BLENDSHAPES)
+    if name.endswith("Left") and name.removesuffix("Left") not in ("jaw", "mouth") and not name.startswith("eyeLook")
+]
+
+
+@dataclass(frozen=True)
+class FlameMatrix:
+    """`rows` (52, 50): FLAME coefficients of every blendshape at 1, in the order of `frames.BLENDSHAPES`."""
+
+    rows: Doubles
+
+    def solve(self, expression: Doubles, jaw_open: Doubles) -> Doubles:
+        """Return blendshapes (N, 52), 0..1, for coefficients (N, 50); jaw_open (N,), 0..1, is taken unchanged."""
+        scale = float(np.sqrt((self.rows**2).sum(axis=1).mean()))
+        each, (left, right) = np.eye(len(BLENDSHAPES)), np.transpose(_SIDES)
+        prices = np.concatenate([_SIZE_PRICE * each, _SIDES_PRICE * (each[left] - each[right])]) * scale
+        wanted = np.concatenate([expression, np.zeros((len(expression), len(prices)))], axis=1)
+        low = np.zeros((len(expression), len(BLENDSHAPES)))
+        high = np.ones_like(low)
+        high[:, _FIXED_AT_0] = 0.0
+        low[:, _JAW] = high[:, _JAW] = jaw_open
+        return bounded_least_squares(np.concatenate([self.rows.T, prices]), wanted, low, high)
+
+
+def read_matrix(file: Path, order: str = "alphabetical") -> FlameMatrix:
+    """Read a matrix of one row per blendshape and at least 50 columns; more (up to 100, jaw, eyes) are left out.
+
+    .npy: rows in the named order of `frames.ORDERS`. .csv: the same, or each row begins with the blendshape's name.
+    Raises ConfigError for a file that cannot be used.
+    """
+    if order not in ORDERS:
+        raise ConfigError(f"order {order!r} is not known ({', '.join(ORDERS)})")
+    names, known = ORDERS[order], (*BLENDSHAPES, "_neutral")
+    try:
+        if file.suffix == ".npy":
+            values = np.load(file, allow_pickle=False).astype(np.float64)
+        else:
+            cells = np.loadtxt(file, dtype=str, delimiter=",", comments=None, encoding="utf-8", ndmin=2)
+            if cells[0, 0] in known:
+                names, cells = tuple(cells[:, 0].tolist()), cells[:, 1:]
+            values = cells.astype(np.float64)
+    except (OSError, ValueError, IndexError) as error:
+        raise ConfigError(f"{file}: not a matrix of numbers: {error}") from error
+    for name in names:
+        if name not in known:
+            raise ConfigError.at(file, "row", name, "is not a blendshape", BLENDSHAPES)
+        if names.count(name) > 1:
+            raise ConfigError.at(file, "row", name, "is given twice")
+    if values.ndim != 2 or values.shape[1] < COEFFICIENTS:
+        raise ConfigError(f"{file}: is {values.shape}, not a row of at least {COEFFICIENTS} per blendshape")
+    if len(values) != len(names):
+        raise ConfigError(f"{file}: has {len(values)} rows, order {order!r} has {len(names)}")
+    if not np.isfinite(values).all():
+        raise ConfigError(f"{file}: row {names[int(np.argwhere(~np.isfinite(values))[0, 0])]} is not finite")
+    rows = np.zeros((len(BLENDSHAPES), COEFFICIENTS))
+    for name, row in zip(names, values, strict=True):
+        if name in BLENDSHAPES:
+            rows[BLENDSHAPES.index(name)] = row[:COEFFICIENTS]
+    if not rows.any():
+        raise ConfigError(f"{file}: holds nothing but zeros")
+    return FlameMatrix(rows)

@@ -1,14 +1,6 @@
-"""The motion spaces that listener papers work in, in one table, and the way from them to ours and back.
+"""Names and units of faces that come from elsewhere: files, the API, Live Link, VMC, the network.
 
-`faceverse58`: 52 expression | 3 rotation, Euler x, y, z with R = Rz Ry Rx | 3 translation. Its neutral is about
-(pi, 0, 0), so every rotation is taken against the neutral one.
-`deca56`: 50 FLAME expression | 3 head axis-angle | 3 jaw axis-angle. FLAME's expression is not ARKit's: it takes a
-matrix that maps one to the other, which no licence lets us ship. Without it pose and jaw move and nothing else.
-
-A rotation R of a space turns our head by A R A^T, where A takes the space's axes to ours (x forward, y left, z up).
-
-The last part of this file decides the names and the units of faces that come from elsewhere, for files, the API and
-the network: `channel_of`, `units_of`, `LiveUnits`, `beyond`.
+`channel_of` decides the names; `units_of`, `LiveUnits` and `beyond` the units.
 """
 
 from __future__ import annotations
@@ -19,303 +11,12 @@ from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from sfms_robot.errors import ConfigError, InputError, did_you_mean
-from sfms_robot.frames import (
-    BLENDSHAPES,
-    CHANNEL_INDEX,
-    CHANNELS,
-    JAW_FULL_OPEN_RAD,
-    MOTION_DIM,
-    ORDERS,
-    POSE,
-    SHAPES,
-    Doubles,
-    Floats,
-    reorder,
-)
-from sfms_robot.signals.rotations import angles_of
-from sfms_robot.signals.rotations import rotation as rotation_of
-
-
-@dataclass(frozen=True, kw_only=True)
-class Space:
-    """One motion space; rotations in radians, translation without a metric scale.
-
-    Attributes:
-        dim: numbers per frame.
-        expression, rotation: their places; `translation` and `jaw` where there are any.
-        euler: the rotation is three angles about the fixed axes x, y, z; otherwise it is axis-angle.
-        axes: A (3, 3), rows are our x, y, z in the space's axes.
-        neutral: rotation of a face that looks straight ahead, as the space writes it.
-    """
-
-    dim: int
-    expression: slice
-    rotation: slice
-    translation: slice | None = None
-    jaw: slice | None = None
-    euler: bool = False
-    axes: tuple[tuple[int, int, int], ...]
-    neutral: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-# The axes of both are unproved and may have to be flipped.
-# FaceVerse: camera frame x to the viewer's right, y down, z away from the viewer (LizhenWangT/FaceVerse @ a012b634:
-# row vectors times R transposed; that the neutral is Rx(pi) follows). FLAME: x to the head's left, y up, z forward.
-SPACES: Final[Mapping[str, Space]] = {
-    "faceverse58": Space(
-        dim=58,
-        expression=slice(0, 52),
-        rotation=slice(52, 55),
-        translation=slice(55, 58),
-        euler=True,
-        axes=((0, 0, -1), (1, 0, 0), (0, -1, 0)),
-        neutral=(np.pi, 0.0, 0.0),
-    ),
-    "deca56": Space(
-        dim=56,
-        expression=slice(0, 50),
-        rotation=slice(50, 53),
-        jaw=slice(53, 56),
-        axes=((0, 0, 1), (1, 0, 0), (0, 1, 0)),
-    ),
-}
-
-
-def decode(
-    frames: Floats | Doubles,
-    space: str,
-    *,
-    neutral: Doubles | None = None,
-    metres_per_unit: float | None = None,
-    flame: FlameMatrix | None = None,
-) -> tuple[Floats, Floats | None]:
-    """Return frames (N, dim) of the named space as our motion (N, 58), and the jaw (N, 3) of a space that has one.
-
-    The jaw is axis-angle in our axes, + about y lowers the chin. `limitation` says what cannot be shown.
-    neutral (dim,): the person's face at rest; by default the space's own, with the translation's median. Blendshapes
-    are clipped to 0..1. Raises ConfigError for an unknown space or a flame matrix where it has no meaning, and
-    ValueError for frames that are not (N, dim) and finite.
-    """
-    known = _space(space)
-    values = np.asarray(frames, dtype=np.float64)
-    if values.ndim != 2 or values.shape[1] != known.dim:
-        raise ValueError(f"{space}: frames are {values.shape}, not (N, {known.dim})")
-    if not np.isfinite(values).all():
-        raise ValueError(f"{space}: frame {int(np.argwhere(~np.isfinite(values))[0, 0])} is not finite")
-    if flame is not None and known.jaw is None:
-        raise ConfigError(f"{space} already is ARKit's expression: it takes no matrix (deca56 does)")
-    rest = np.asarray(known.neutral) if neutral is None else np.asarray(neutral)[known.rotation]
-    axes, upright = _at_rest(space, *rest.tolist())
-
-    motion = np.zeros((len(values), MOTION_DIM))
-    motion[:, POSE][:, :3] = angles_of(axes @ _rotations(known, values[:, known.rotation]) @ upright.T)
-    if known.translation is not None and metres_per_unit is not None and len(values):
-        place = values[:, known.translation]
-        home = np.median(place, axis=0) if neutral is None else np.asarray(neutral)[known.translation]
-        motion[:, POSE][:, 3:] = metres_per_unit * (place - home) @ axes.T
-
-    if known.jaw is None:
-        shapes = reorder(values[:, known.expression], "faceverse")
-        motion[:, SHAPES] = np.minimum(np.maximum(shapes, 0.0), 1.0)
-        return motion.astype(np.float32), None
-    jaw_rad = values[:, known.jaw] @ axes.T
-    jaw_open = np.clip(jaw_rad[:, 1] / JAW_FULL_OPEN_RAD, 0.0, 1.0)
-    if flame is not None:
-        motion[:, SHAPES] = flame.solve(values[:, known.expression], jaw_open)
-    motion[:, SHAPES][:, _JAW] = jaw_open
-    return motion.astype(np.float32), jaw_rad.astype(np.float32)
-
-
-def encode(
-    motion: Floats | Doubles,
-    space: str = "faceverse58",
-    *,
-    neutral: Doubles | None = None,
-    metres_per_unit: float | None = None,
-) -> Floats:
-    """Return our motion (N, 58) in a space (N, dim), about `neutral` (dim,), by default the space's own.
-
-    Without `metres_per_unit` the translation stays at rest. deca56 takes pose and jaw, its expression stays at rest:
-    ours cannot be written in it. Raises ConfigError for an unknown space.
-    """
-    known = _space(space)
-    values = np.asarray(motion, dtype=np.float64)
-    rest = rest_of(space) if neutral is None else np.asarray(neutral, dtype=np.float64)
-    axes, upright = _at_rest(space, *rest[known.rotation].tolist())
-    whole = axes.T @ rotation_of(values[:, POSE][:, :3]) @ upright
-    out = np.tile(rest, (len(values), 1))
-    if known.euler:
-        out[:, known.rotation] = angles_of(whole)
-        out[:, known.rotation.start] %= 2 * np.pi  # about pi, not about -pi
-    else:
-        from scipy.spatial.transform import Rotation
-
-        out[:, known.rotation] = Rotation.from_matrix(whole).as_rotvec()
-    if known.translation is not None and metres_per_unit is not None:
-        out[:, known.translation] += values[:, POSE][:, 3:] @ axes / metres_per_unit
-    if known.jaw is None:
-        out[:, known.expression] = values[:, SHAPES]
-    else:
-        opening = JAW_FULL_OPEN_RAD * values[:, SHAPES][:, _JAW]
-        out[:, known.jaw] += opening[:, None] * axes[1]
-    return out.astype(np.float32)
-
-
-def rest_of(space: str) -> Doubles:
-    """Return a face at rest (dim,) that looks straight ahead. Raises ConfigError for an unknown space."""
-    if space == "arkit58":  # our own
-        return np.zeros(MOTION_DIM)
-    known = _space(space)
-    out = np.zeros(known.dim)
-    out[known.rotation] = known.neutral
-    return out
-
-
-def limitation(space: str, flame: FlameMatrix | None) -> str | None:
-    """Return the limitation of the space in one line, or None."""
-    if space != "deca56" or flame is not None:
-        return None
-    return f"{space} without a matrix drives pose and jaw only: expression is not shown"
-
-
-def _space(name: str) -> Space:
-    if name not in SPACES:
-        raise ConfigError(f"motion space {name!r} is not known ({', '.join(SPACES)})")
-    return SPACES[name]
-
-
-@lru_cache(maxsize=64)
-def _at_rest(space: str, *rotation: float) -> tuple[Doubles, Doubles]:
-    """Return A (3, 3) of a space, and A times the rotation of a face at rest. Not to be changed in place.
-
-    A head's rotation in the space is A^T R (A times rest), R being ours.
-    """
-    known = _space(space)
-    axes = np.array(known.axes, dtype=np.float64)
-    return axes, axes @ _rotations(known, np.array([rotation]))[0]
-
-
-def _rotations(space: Space, values: Doubles) -> Doubles:
-    """Return matrices (N, 3, 3) of rotations (N, 3) as the space writes them."""
-    if space.euler:
-        return rotation_of(values)
-    from scipy.spatial.transform import Rotation
-
-    turns: Doubles = Rotation.from_rotvec(values).as_matrix()
-    return turns
-
-
-# --- FLAME's expression as ARKit blendshapes, with a matrix that the user brings --------------------------------------
-#
-# The matrix has one row of FLAME coefficients per blendshape: weights @ matrix = coefficients. Such matrices are badly
-# conditioned (rows of rare shapes are huge), so it is not inverted: the result is the nearest weights within 0..1, with
-# a small price on their size and on left and right being different. Gaze is not in FLAME's expression: its channels
-# stay 0. The rows of the jaw are not used, because the jaw has a pose.
-
-COEFFICIENTS: Final = 50  # the first ones, those that deca56 has
-_SIZE_PRICE: Final = 0.02  # of the matrix's own scale
-_SIDES_PRICE: Final = 0.05
-_JAW: Final = BLENDSHAPES.index("jawOpen")
-_FIXED_AT_0: Final = [i for i, name in enumerate(BLENDSHAPES) if name.startswith("eyeLook")]
-_SIDES: Final = [
-    (i, BLENDSHAPES.index(name.removesuffix("Left") + "Right"))
-    for i, name in enumerate(BLENDSHAPES)
-    if name.endswith("Left") and name.removesuffix("Left") not in ("jaw", "mouth") and not name.startswith("eyeLook")
-]
-_STEPS: Final = 400
-_SETTLED: Final = 1e-8  # largest change of an unknown in one step
-
-
-def bounded_least_squares(matrix: Doubles, wanted: Doubles, low: Doubles, high: Doubles) -> Doubles:
-    """Return the x (N, n), low <= x <= high, with the least ||matrix x - wanted||^2, per row of `wanted` (N, m).
-
-    matrix (m, n) of full column rank (add rows of a ridge where it is not); low, high (n,) or (N, n). Accelerated
-    projected gradient with restarts (O'Donoghue and Candes 2015): every step is one matrix product for all N.
-    """
-    gram = matrix.T @ matrix
-    target = wanted @ matrix  # (N, n)
-    step = 1.0 / float(np.linalg.eigvalsh(gram)[-1])
-    here: Doubles = np.clip(np.linalg.solve(gram, target.T).T, low, high)
-    ahead, momentum = here, np.ones((len(wanted), 1))
-    for _ in range(_STEPS):
-        slope = ahead @ gram - target
-        there: Doubles = np.clip(ahead - step * slope, low, high)
-        moved = there - here
-        uphill = (slope * moved).sum(axis=1, keepdims=True) > 0
-        momentum = np.where(uphill, 1.0, momentum)
-        following = (1.0 + np.sqrt(1.0 + 4.0 * momentum**2)) / 2.0
-        ahead = there + np.where(uphill, 0.0, (momentum - 1.0) / following) * moved
-        here, momentum = there, following
-        if np.abs(moved).max(initial=0.0) < _SETTLED:
-            break
-    return here
-
-
-@dataclass(frozen=True)
-class FlameMatrix:
-    """`rows` (52, 50): FLAME coefficients of every blendshape at 1, in the order of `frames.BLENDSHAPES`."""
-
-    rows: Doubles
-
-    def solve(self, expression: Doubles, jaw_open: Doubles) -> Doubles:
-        """Return blendshapes (N, 52), 0..1, for coefficients (N, 50); jaw_open (N,), 0..1, is taken unchanged."""
-        scale = float(np.sqrt((self.rows**2).sum(axis=1).mean()))
-        each, (left, right) = np.eye(len(BLENDSHAPES)), np.transpose(_SIDES)
-        prices = np.concatenate([_SIZE_PRICE * each, _SIDES_PRICE * (each[left] - each[right])]) * scale
-        wanted = np.concatenate([expression, np.zeros((len(expression), len(prices)))], axis=1)
-        low = np.zeros((len(expression), len(BLENDSHAPES)))
-        high = np.ones_like(low)
-        high[:, _FIXED_AT_0] = 0.0
-        low[:, _JAW] = high[:, _JAW] = jaw_open
-        return bounded_least_squares(np.concatenate([self.rows.T, prices]), wanted, low, high)
-
-
-def read_matrix(file: Path, order: str = "alphabetical") -> FlameMatrix:
-    """Read a matrix of one row per blendshape and at least 50 columns; more (up to 100, jaw, eyes) are left out.
-
-    .npy: rows in the named order of `frames.ORDERS`. .csv: the same, or each row begins with the blendshape's name.
-    Raises ConfigError for a file that cannot be used.
-    """
-    if order not in ORDERS:
-        raise ConfigError(f"order {order!r} is not known ({', '.join(ORDERS)})")
-    names, known = ORDERS[order], (*BLENDSHAPES, "_neutral")
-    try:
-        if file.suffix == ".npy":
-            values = np.load(file, allow_pickle=False).astype(np.float64)
-        else:
-            cells = np.loadtxt(file, dtype=str, delimiter=",", comments=None, encoding="utf-8", ndmin=2)
-            if cells[0, 0] in known:
-                names, cells = tuple(cells[:, 0].tolist()), cells[:, 1:]
-            values = cells.astype(np.float64)
-    except (OSError, ValueError, IndexError) as error:
-        raise ConfigError(f"{file}: not a matrix of numbers: {error}") from error
-    for name in names:
-        if name not in known:
-            raise ConfigError.at(file, "row", name, "is not a blendshape", BLENDSHAPES)
-        if names.count(name) > 1:
-            raise ConfigError.at(file, "row", name, "is given twice")
-    if values.ndim != 2 or values.shape[1] < COEFFICIENTS:
-        raise ConfigError(f"{file}: is {values.shape}, not a row of at least {COEFFICIENTS} per blendshape")
-    if len(values) != len(names):
-        raise ConfigError(f"{file}: has {len(values)} rows, order {order!r} has {len(names)}")
-    if not np.isfinite(values).all():
-        raise ConfigError(f"{file}: row {names[int(np.argwhere(~np.isfinite(values))[0, 0])]} is not finite")
-    rows = np.zeros((len(BLENDSHAPES), COEFFICIENTS))
-    for name, row in zip(names, values, strict=True):
-        if name in BLENDSHAPES:
-            rows[BLENDSHAPES.index(name)] = row[:COEFFICIENTS]
-    if not rows.any():
-        raise ConfigError(f"{file}: holds nothing but zeros")
-    return FlameMatrix(rows)
-
-
-# --- Names and units of faces that come from elsewhere: files, the API, Live Link, VMC, the network -------------------
+from sfms_robot.errors import InputError, did_you_mean
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, MOTION_DIM, SHAPES, Doubles, Floats
 
 # Head pose: HeadYaw, yaw_deg, x_m, "pitch (deg)". A name that begins with "head" is measured from a camera.
 _POSE_NAME: Final = re.compile(
@@ -477,3 +178,34 @@ class LiveUnits:
             )
             ours = self.units.ours(motion)
         return None if waits or beyond(ours, _MOST_TURN_RAD if self._angles else 2 * math.pi) else ours
+
+
+# --- Least squares within bounds --------------------------------------------------------------------------------------
+
+_STEPS: Final = 400
+_SETTLED: Final = 1e-8  # largest change of an unknown in one step
+
+
+def bounded_least_squares(matrix: Doubles, wanted: Doubles, low: Doubles, high: Doubles) -> Doubles:
+    """Return the x (N, n), low <= x <= high, with the least ||matrix x - wanted||^2, per row of `wanted` (N, m).
+
+    matrix (m, n) of full column rank (add rows of a ridge where it is not); low, high (n,) or (N, n). Accelerated
+    projected gradient with restarts (O'Donoghue and Candes 2015): every step is one matrix product for all N.
+    """
+    gram = matrix.T @ matrix
+    target = wanted @ matrix  # (N, n)
+    step = 1.0 / float(np.linalg.eigvalsh(gram)[-1])
+    here: Doubles = np.clip(np.linalg.solve(gram, target.T).T, low, high)
+    ahead, momentum = here, np.ones((len(wanted), 1))
+    for _ in range(_STEPS):
+        slope = ahead @ gram - target
+        there: Doubles = np.clip(ahead - step * slope, low, high)
+        moved = there - here
+        uphill = (slope * moved).sum(axis=1, keepdims=True) > 0
+        momentum = np.where(uphill, 1.0, momentum)
+        following = (1.0 + np.sqrt(1.0 + 4.0 * momentum**2)) / 2.0
+        ahead = there + np.where(uphill, 0.0, (momentum - 1.0) / following) * moved
+        here, momentum = there, following
+        if np.abs(moved).max(initial=0.0) < _SETTLED:
+            break
+    return here

@@ -13,8 +13,7 @@ from sfms_robot.lab.corpora.conversion import Residual, to_ours
 from sfms_robot.lab.corpora.data_commands import convert_data
 from sfms_robot.lab.corpora.formats import detect, open_dataset, open_for, split_names
 from sfms_robot.lab.learning.sfms.features import gather
-from sfms_robot.listeners.space import MotionSpace
-from sfms_robot.signals.spaces import COEFFICIENTS, decode, rest_of
+from sfms_robot.listeners.space import COEFFICIENTS, MotionSpace, rest_of
 
 
 def matrix(folder):
@@ -54,7 +53,9 @@ def test_converted_motion_at_25_fps_is_what_decoding_the_files_gives(tmp_path):
     convert_data(source, tmp_path / "out")
     for theirs in open_dataset(source, "test"):
         ours = clips.read(tmp_path / "out" / "test" / f"{theirs.name}.npz")
-        np.testing.assert_allclose(ours.listener, decode(theirs.listener, "deca56")[0], atol=1e-3)
+        np.testing.assert_allclose(
+            ours.listener, MotionSpace("deca56", rest_of("deca56")).decode(theirs.listener)[0], atol=1e-3
+        )
         np.testing.assert_allclose(ours.audio, theirs.audio, atol=1e-4)
         np.testing.assert_allclose(ours.agent_audio, theirs.agent_audio, atol=1e-4)
         np.testing.assert_array_equal(ours.listening, theirs.listening)

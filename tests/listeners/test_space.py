@@ -1,13 +1,17 @@
-"""What a listener hears and shows does not depend on the motion space it works in."""
+"""Motion spaces of the papers: laws of the conversion, and listeners that work in any of them."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from tiny_sfms import plans_of, speech, tiny_listener, tiny_settings
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import SPACE_CHANNELS
-from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, JAW_FULL_OPEN_RAD, ORDERS, SHAPES, SPACE_CHANNELS
+from sfms_robot.listeners.space import SPACES, FlameMatrix, MotionSpace, read_matrix
 
+RNG = np.random.default_rng(5)
+MATRIX = RNG.normal(size=(52, 50))
 PRESET = {"preset": "one", "levels": [3, 3], "keyframes": 6}
 
 
@@ -42,6 +46,83 @@ def test_deca_keeps_pose_and_jaw_and_rest_in_every_space_is_a_face_at_rest():
     for name in SPACE_CHANNELS:
         at_rest = space(name)
         assert at_rest.decode(at_rest.neutral[None].astype(np.float32))[0] == pytest.approx(np.zeros((1, 58)), abs=1e-6)
+
+
+@pytest.mark.parametrize("known", SPACES.values(), ids=SPACES)
+def test_axes_are_a_rotation(known):
+    axes = np.array(known.axes)
+    assert np.array_equal(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
+
+
+def test_a_translation_without_a_metric_scale_moves_nothing():
+    frames = space("faceverse58").encode(faces())
+    frames[:, 55:] = RNG.normal(size=(20, 3))
+    assert not space("faceverse58").decode(frames)[0][:, 3:6].any()
+
+
+@pytest.mark.parametrize(("index", "channel"), [(50, "pitch"), (51, "yaw"), (52, "roll")])
+def test_flame_turns_about_its_own_axes(index, channel):
+    frame = np.zeros((1, 56))
+    frame[0, index] = 0.3
+    pose = space("deca56").decode(frame)[0][0, :6]
+    assert pose[CHANNEL_INDEX[channel]] == pytest.approx(0.3, abs=1e-6)
+    assert np.count_nonzero(np.abs(pose) > 1e-6) == 1
+
+
+def test_without_a_matrix_pose_and_jaw_alone_move():
+    frames = RNG.normal(size=(5, 56))
+    frames[:, 53] = JAW_FULL_OPEN_RAD / 2
+    motion, jaw_rad = space("deca56").decode(frames)
+    shapes = motion[:, SHAPES]
+    assert shapes[:, BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5)
+    assert np.count_nonzero(shapes) == len(frames)
+    assert jaw_rad is not None and jaw_rad[:, 1] == pytest.approx(JAW_FULL_OPEN_RAD / 2)
+
+
+def test_expression_comes_back_through_the_matrix():
+    shown = [BLENDSHAPES.index(name) for name in ("mouthSmileLeft", "mouthSmileRight", "browInnerUp", "cheekPuff")]
+    weights = np.zeros((30, 52))
+    weights[:, shown] = RNG.uniform(0.2, 0.9, (30, 1))
+    frames = np.zeros((30, 56))
+    frames[:, :50] = weights @ MATRIX
+    deca = replace(space("deca56"), flame=FlameMatrix(MATRIX))
+    motion, _ = deca.decode(frames)
+    assert deca.limitation is None
+    assert np.abs(motion[:, SHAPES] - weights).mean() < 0.02
+    assert np.abs(motion[:, SHAPES][:, shown] - weights[:, shown]).max() < 0.1
+
+
+def test_solved_weights_are_bounded_and_gaze_stays_still():
+    weights = FlameMatrix(MATRIX).solve(RNG.normal(scale=5, size=(20, 50)), np.zeros(20))
+    assert weights.min() >= 0 and weights.max() <= 1
+    assert not weights[:, [name.startswith("eyeLook") for name in BLENDSHAPES]].any()
+
+
+def test_matrix_files_of_both_kinds_are_the_same_matrix(tmp_path):
+    by_order = MATRIX[[BLENDSHAPES.index(name) for name in ORDERS["apple"]]]
+    np.save(tmp_path / "m.npy", by_order)
+    lines = [",".join([name, *map(repr, row.tolist())]) for name, row in zip(ORDERS["apple"], by_order, strict=True)]
+    (tmp_path / "m.csv").write_text("\n".join(lines))
+    assert np.array_equal(read_matrix(tmp_path / "m.npy", "apple").rows, MATRIX)
+    assert np.array_equal(read_matrix(tmp_path / "m.csv").rows, MATRIX)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [("1,2\n3,4\n", "not a row of at least 50"), ("smile,1\n", "numbers"), ("jawOpen,1\nsmile,2\n", "'smile'")],
+)
+def test_bad_matrix_is_told_in_one_line(tmp_path, text, told):
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(ConfigError, match=told) as error:
+        read_matrix(tmp_path / "m.csv")
+    assert "m.csv" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_what_is_no_frame_is_refused():
+    with pytest.raises(ValueError, match=r"not \(N, 56\)"):
+        space("deca56").decode(np.zeros((1, 58)))
+    with pytest.raises(ValueError, match="frame 1 is not finite"):
+        space("deca56").decode(np.array([[0.0] * 56, [np.nan] * 56]))
 
 
 @pytest.mark.parametrize("name", ["faceverse58", "deca56"])

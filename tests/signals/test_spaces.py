@@ -1,79 +1,12 @@
-"""Motion spaces of the papers: laws of the conversion, and what is told when something is missing."""
+"""Names and units of faces that come from elsewhere, and least squares within bounds."""
 
 import numpy as np
 import pytest
 
-from sfms_robot.errors import ConfigError
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS, SHAPES
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX
 from sfms_robot.signals import spaces
 
 RNG = np.random.default_rng(5)
-MATRIX = RNG.normal(size=(52, 50))
-
-
-def faces(count=40):
-    motion = np.zeros((count, 58), dtype=np.float32)
-    motion[:, :3] = RNG.uniform(-0.6, 0.6, (count, 3))
-    motion[:, 3:6] = RNG.uniform(-0.05, 0.05, (count, 3))
-    motion[:, SHAPES] = RNG.uniform(0, 1, (count, 52))
-    return motion
-
-
-@pytest.mark.parametrize("space", spaces.SPACES.values(), ids=spaces.SPACES)
-def test_axes_are_a_rotation(space):
-    axes = np.array(space.axes)
-    assert np.array_equal(axes @ axes.T, np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
-
-
-def test_faceverse_and_back_is_the_same_face():
-    motion, neutral = faces(), spaces.encode(np.zeros((1, 58)))[0]
-    frames = spaces.encode(motion, metres_per_unit=1.0)
-    back, jaw_rad = spaces.decode(frames, "faceverse58", neutral=neutral, metres_per_unit=1.0)
-    assert np.abs(back - motion).max() < 1e-5 and jaw_rad is None
-
-
-def test_faceverse_neutral_looks_straight_ahead_and_its_translation_has_no_metric_scale():
-    frame = np.zeros((1, 58))
-    frame[0, 52] = np.pi
-    assert np.abs(spaces.decode(frame, "faceverse58")[0]).max() < 1e-6
-    assert not spaces.decode(spaces.encode(faces()), "faceverse58")[0][:, 3:6].any()
-
-
-@pytest.mark.parametrize(("index", "channel"), [(50, "pitch"), (51, "yaw"), (52, "roll")])
-def test_flame_turns_about_its_own_axes(index, channel):
-    frame = np.zeros((1, 56))
-    frame[0, index] = 0.3
-    pose = spaces.decode(frame, "deca56")[0][0, :6]
-    assert pose[CHANNEL_INDEX[channel]] == pytest.approx(0.3, abs=1e-6)
-    assert np.count_nonzero(np.abs(pose) > 1e-6) == 1
-
-
-def test_without_a_matrix_pose_and_jaw_move_and_it_says_so():
-    frames = RNG.normal(size=(5, 56))
-    frames[:, 53] = spaces.JAW_FULL_OPEN_RAD / 2
-    motion, jaw_rad = spaces.decode(frames, "deca56")
-    assert "pose and jaw only" in (spaces.limitation("deca56", None) or "")
-    shapes = motion[:, SHAPES]
-    assert shapes[:, BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5) and np.count_nonzero(shapes) == len(frames)
-    assert jaw_rad is not None and jaw_rad[:, 1] == pytest.approx(spaces.JAW_FULL_OPEN_RAD / 2)
-
-
-def test_expression_comes_back_through_the_matrix():
-    shown = [BLENDSHAPES.index(name) for name in ("mouthSmileLeft", "mouthSmileRight", "browInnerUp", "cheekPuff")]
-    weights = np.zeros((30, 52))
-    weights[:, shown] = RNG.uniform(0.2, 0.9, (30, 1))
-    frames = np.zeros((30, 56))
-    frames[:, :50] = weights @ MATRIX
-    motion, _ = spaces.decode(frames, "deca56", flame=spaces.FlameMatrix(MATRIX))
-    assert spaces.limitation("deca56", spaces.FlameMatrix(MATRIX)) is None
-    assert np.abs(motion[:, SHAPES] - weights).mean() < 0.02
-    assert np.abs(motion[:, SHAPES][:, shown] - weights[:, shown]).max() < 0.1
-
-
-def test_solved_weights_are_bounded_and_gaze_stays_still():
-    weights = spaces.FlameMatrix(MATRIX).solve(RNG.normal(scale=5, size=(20, 50)), np.zeros(20))
-    assert weights.min() >= 0 and weights.max() <= 1
-    assert not weights[:, [name.startswith("eyeLook") for name in BLENDSHAPES]].any()
 
 
 def test_bounded_solution_cannot_be_bettered():
@@ -84,35 +17,6 @@ def test_bounded_solution_cannot_be_bettered():
     at_low, at_high = x <= -0.2, x >= 0.5
     assert np.abs(slope[~at_low & ~at_high]).max() < 1e-4
     assert (slope[at_low] > -1e-4).all() and (slope[at_high] < 1e-4).all()
-
-
-def test_matrix_files_of_both_kinds_are_the_same_matrix(tmp_path):
-    by_order = MATRIX[[BLENDSHAPES.index(name) for name in ORDERS["apple"]]]
-    np.save(tmp_path / "m.npy", by_order)
-    lines = [",".join([name, *map(repr, row.tolist())]) for name, row in zip(ORDERS["apple"], by_order, strict=True)]
-    (tmp_path / "m.csv").write_text("\n".join(lines))
-    assert np.array_equal(spaces.read_matrix(tmp_path / "m.npy", "apple").rows, MATRIX)
-    assert np.array_equal(spaces.read_matrix(tmp_path / "m.csv").rows, MATRIX)
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [("1,2\n3,4\n", "not a row of at least 50"), ("smile,1\n", "numbers"), ("jawOpen,1\nsmile,2\n", "'smile'")],
-)
-def test_bad_matrix_is_told_in_one_line(tmp_path, text, told):
-    (tmp_path / "m.csv").write_text(text)
-    with pytest.raises(ConfigError, match=told) as error:
-        spaces.read_matrix(tmp_path / "m.csv")
-    assert "m.csv" in str(error.value) and "\n" not in str(error.value)
-
-
-def test_what_is_no_frame_is_refused():
-    with pytest.raises(ConfigError, match="faceverse58, deca56"):
-        spaces.decode(np.zeros((1, 58)), "emoca")
-    with pytest.raises(ValueError, match=r"not \(N, 56\)"):
-        spaces.decode(np.zeros((1, 58)), "deca56")
-    with pytest.raises(ValueError, match="frame 1 is not finite"):
-        spaces.decode(np.array([[0.0] * 56, [np.nan] * 56]), "deca56")
 
 
 @pytest.mark.parametrize(

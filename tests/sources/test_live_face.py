@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, POSE, POSE_CHANNELS, SHAPES
-from sfms_robot.signals.rotations import rotation
-from sfms_robot.signals.spaces import angles_of
+from sfms_robot.signals.rotations import angles_of, rotation
 from sfms_robot.sources import live_face as live
 from sfms_robot.sources.registry import split_kind
 
@@ -198,7 +197,7 @@ def sight(caplog):
 
 def feed(sight, sender, *times_s, data=b"\x0a"):
     for time_s in times_s:
-        sight.feed(live.Datagram(data, sender, time_s))
+        sight.feed(data, sender, time_s)
 
 
 def counts(sight):

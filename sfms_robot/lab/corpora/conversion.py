@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE, SHAPES, Doubles, Floats
 from sfms_robot.lab.corpora.clips import FAU_VALUE, FULL, WITHOUT_SHAPE, Dyad, at_rate, blendshapes_of, samples_of
+from sfms_robot.listeners.space import SPACES, FlameMatrix, MotionSpace, rest_of
 from sfms_robot.signals.mel import ROWS_PER_FRAME
-from sfms_robot.signals.rotations import rotation
-from sfms_robot.signals.spaces import SPACES, FlameMatrix, decode, encode, limitation
+from sfms_robot.signals.rotations import angle_between
 from sfms_robot.signals.tracks import Track, resample
 
 CONVERTIBLE: Final = ("arkit58", "deca56", "faceverse58", "seamless27")
@@ -112,12 +112,13 @@ def in_ours(motion: Floats, space: str, flame: FlameMatrix | None = None) -> Flo
     if space == "arkit58":
         out[known] = motion[known]
     elif space == "seamless27":
-        turned = np.zeros((int(known.sum()), SPACES["deca56"].dim))
+        deca = MotionSpace("deca56", rest_of("deca56"))
+        turned = np.tile(deca.neutral, (int(known.sum()), 1))
         turned[:, SPACES["deca56"].rotation] = motion[known, _ANGLES]
-        out[known] = decode(turned, "deca56")[0]
+        out[known] = deca.decode(turned)[0]
         out[known, SHAPES] = blendshapes_of(motion[known, _UNITS])
     else:
-        out[known] = decode(motion[known], space, flame=flame)[0]
+        out[known] = MotionSpace(space, rest_of(space), flame=flame).decode(motion[known])[0]
     return out
 
 
@@ -130,7 +131,9 @@ def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | Non
         shown = ours[:, SHAPES].astype(np.float64) @ flame.rows if flame is not None else 0.0
         expression = filed[:, SPACES["deca56"].expression]
         lost = expression - shown
-        residual.notes |= dict.fromkeys(filter(None, [limitation("deca56", flame)]))
+        residual.notes |= dict.fromkeys(
+            filter(None, [MotionSpace("deca56", rest_of("deca56"), flame=flame).limitation])
+        )
     else:
         seamless = dyad.space == "seamless27"
         columns, low, high = (_UNITS, -np.inf, FULL) if seamless else (SPACES[dyad.space].expression, 0.0, 1.0)
@@ -146,17 +149,10 @@ def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | Non
 
 def _apart_rad(filed: Doubles, ours: Floats, space: str) -> Doubles:
     """Return angles (N,) between heads as filed, and ours expressed in the source's terms again."""
-    from scipy.spatial.transform import Rotation
-
-    name = "deca56" if space == "seamless27" else space
-    columns = _ANGLES if space == "seamless27" else SPACES[name].rotation
-    back = encode(ours, name)[:, SPACES[name].rotation].astype(np.float64)
-
-    def turns(rows: Doubles) -> Rotation:
-        return Rotation.from_matrix(rotation(rows)) if SPACES[name].euler else Rotation.from_rotvec(rows)
-
-    apart: Doubles = (turns(filed[:, columns]) * turns(back).inv()).magnitude()
-    return apart
+    name, columns = ("deca56", _ANGLES) if space == "seamless27" else (space, SPACES[space].rotation)
+    known = SPACES[name]
+    back = MotionSpace(name, rest_of(name)).encode(ours)[:, known.rotation].astype(np.float64)
+    return angle_between(known.matrices(filed[:, columns]), known.matrices(back))
 
 
 # --- Dyads of other frame rates at 25 fps: what a listener that is streamed through them asks for -----------------

@@ -23,7 +23,7 @@ from sfms_robot.lab.corpora.clips import SEAMLESS_CHANNELS, Dyad
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order, Problem, guarded
 from sfms_robot.lab.corpora.compose.composed import compose_folder
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, FIGURES, Residual, to_ours
-from sfms_robot.signals.spaces import FlameMatrix, read_matrix
+from sfms_robot.listeners.space import FlameMatrix, read_matrix
 
 Figures = dict[str, Any]  # for JSON
 

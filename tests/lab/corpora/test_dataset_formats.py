@@ -20,9 +20,8 @@ from sfms_robot.lab.corpora.external import react
 from sfms_robot.lab.corpora.formats import LAYOUTS, detect, looks_like, open_dataset, open_for, split_names
 from sfms_robot.lab.learning.sfms.features import gather
 from sfms_robot.listeners.audio_frontend import AudioFrontend
-from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.space import MotionSpace, rest_of
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.signals.spaces import decode, rest_of
 
 
 def composed(root: Path) -> Path:
@@ -231,7 +230,8 @@ def test_dualtalk_angles_in_arkit_s_edition_are_the_turns_of_flame_s(tmp_path):
     rows[:, 52:55] = Rotation.from_rotvec(vectors).as_euler("YXZ")
     np.save(file, rows)
     arkit = open_dataset(tmp_path, "test")[0]
-    flame = decode(open_dataset(tmp_path, "test", layout="dualtalk")[0].listener, "deca56")[0]
+    filed = open_dataset(tmp_path, "test", layout="dualtalk")[0].listener
+    flame = MotionSpace("deca56", rest_of("deca56")).decode(filed)[0]
     np.testing.assert_allclose(arkit.listener[:, :3], flame[:, :3], atol=1e-6)
 
 

@@ -11,9 +11,8 @@ from sfms_robot.lab.corpora.clips import Dyad, at_rate, samples_of
 from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.learning.sfms.features import gather
 from sfms_robot.listeners.audio_frontend import AudioFrontend
-from sfms_robot.listeners.space import MotionSpace
+from sfms_robot.listeners.space import MotionSpace, rest_of
 from sfms_robot.signals import phase
-from sfms_robot.signals.spaces import rest_of
 
 RNG = np.random.default_rng(5)
 

@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.frames import POSE, SHAPES, Floats, reorder
+from sfms_robot.frames import BLENDSHAPES, ORDERS, POSE, SHAPES, Floats
 from sfms_robot.lab.corpora.clips import WIDTHS, Dyad
 from sfms_robot.lab.corpora.collection import (
     Clip,
@@ -44,7 +44,7 @@ DEMO: Final = "demo"
 PARTS: Final = {"exp": 50, "pose": 6}
 ARKIT_FOLDER: Final = "ARKit_npy"
 ARKIT_WIDTH: Final = 61
-_SHAPES: Final = slice(0, 52)
+_SHAPES: Final = [ORDERS["apple"].index(name) for name in BLENDSHAPES]  # columns of our shapes
 _YAW_PITCH_ROLL: Final = slice(52, 55)
 
 
@@ -88,7 +88,7 @@ def _arkit_rows(file: Path, frames: int, gaps: bool) -> Floats:
     filed = track(str(file), npy(file), frames, ARKIT_WIDTH, gaps=gaps)
     out = np.zeros((frames, WIDTHS["arkit58"]), np.float32)
     out[:, POSE][:, :3] = filed[:, _YAW_PITCH_ROLL][:, ::-1]
-    out[:, SHAPES] = np.clip(reorder(filed[:, _SHAPES], "apple"), 0.0, 1.0)
+    out[:, SHAPES] = np.clip(filed[:, _SHAPES], 0.0, 1.0)
     return out
 
 
