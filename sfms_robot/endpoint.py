@@ -184,18 +184,24 @@ def addresses_of_this_machine() -> list[str]:
 
 
 class ServerThread:
-    """A thread with an event loop for a server on a socket that listens already. Its port is held until `close`.
+    """A thread with an event loop for a server, at an address that is held from construction until `close`.
 
     A subclass defines `_serve`, which serves `_socket` and returns soon after `_closing` is set.
+
+    Args: `flag`, `host`, `port` as of `listen`. Raises PortError.
+
+    Attributes:
+        address: host and port that are bound.
     """
 
-    def __init__(self, listening: socket.socket, name: str, stop_s: float) -> None:
+    def __init__(self, flag: str, host: str, port: int, stop_s: float) -> None:
         import asyncio  # slow to load, and most users of this module have no server
 
-        self._socket, self._stop_s = listening, stop_s
+        self._socket, self._stop_s = listen(flag, host, port), stop_s
+        self.address: tuple[str, int] = self._socket.getsockname()[:2]
         self._loop = asyncio.new_event_loop()
         self._closing = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread = threading.Thread(target=self._run, name=flag, daemon=True)
 
     def start(self) -> None:
         """Take connections from now on. Idempotent."""

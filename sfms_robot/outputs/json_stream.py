@@ -32,7 +32,7 @@ from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from sfms_robot.endpoint import LOOPBACK, ServerThread, address_text, host_problem, listen, origin_problem, port_number
+from sfms_robot.endpoint import LOOPBACK, ServerThread, address_text, host_problem, origin_problem, port_number
 from sfms_robot.errors import NOTE, ConfigError
 from sfms_robot.frames import BLENDSHAPES, POSE, POSE_CHANNELS, SHAPES
 from sfms_robot.ports import Facts, Output, OutputFrame
@@ -96,8 +96,8 @@ class JsonStream(ServerThread, Output):
                 f"--output json:{argument}: expected a TCP port of this machine from 0 to 65535 (0: any free one), "
                 f"got {argument!r}"
             )
-        super().__init__(listen("--output json", LOOPBACK, port), "output json", 2 * _STOP_S)
-        self.peer = address_text(*self._socket.getsockname()[:2])
+        super().__init__("--output json", LOOPBACK, port, 2 * _STOP_S)
+        self.peer = address_text(*self.address)
         self._counts = dict.fromkeys(("refused", "missed"), 0)
         self._clients: set[ServerConnection] = set()  # open; for the server's thread
         self._opening: dict[ServerConnection, None] = {}  # oldest first

@@ -36,9 +36,11 @@ from sfms_robot.signals.spaces import beyond
 
 VERSION: Final = 1
 VOICE, FACE, SPEECH, MICROPHONE = 1, 2, 3, 4
-FEEDS: Final = {"voice": VOICE, "face": FACE, "speech": SPEECH}
+FEEDS: Final = {VOICE: "voice", FACE: "face", SPEECH: "speech"}
 LONGEST: Final = 1_048_576  # bytes: 21.8 s at 24 kHz
 LONGEST_JSON: Final = 4096
+_WINDOW_S: Final = 10.0  # that a clock is remembered, once or twice
+_SET_S: Final = 1.0  # a message that took so much longer than the quickest: the clock was set
 
 _HEADER: Final = struct.Struct("<BBHIdd")
 _SOUND_IS: Final = "sound comes in binary messages, int16 behind a header of 24 bytes (docs/reference/protocol.md)"
@@ -64,15 +66,15 @@ class Hello(BaseModel):
 class Hush(BaseModel):
     """The robot's remaining speech will not be played."""
 
-    kind: ClassVar[int] = SPEECH
+    feed: ClassVar[str] = "speech"
     type: Literal["hush"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SoundMessage:
-    """Voice, speech or microphone, by `kind`. `samples` (n,) int16; times in seconds of the sender, `at_s` 0: none."""
+    """Voice or speech, by `feed`. `samples` (n,) int16; times in seconds of the sender, `at_s` 0: none."""
 
-    kind: int
+    feed: str
     rate_hz: int
     sent_s: float
     at_s: float
@@ -83,7 +85,7 @@ class SoundMessage:
 class SeenMessage:
     """A person's face, motion (58,), None: lost; times as of `SoundMessage`."""
 
-    kind: ClassVar[int] = FACE
+    feed: ClassVar[str] = "face"
     sent_s: float
     at_s: float
     motion: Floats | None
@@ -105,12 +107,13 @@ def parse_message(data: bytes) -> Message:
     if len(data) < _HEADER.size:
         raise PacketError(f"a message of {len(data)} bytes, shorter than a header")
     kind, version, zero, rate_hz, sent_s, at_s = _HEADER.unpack_from(data)
-    if data[:4] in _FILES or (kind not in FEEDS.values()) + (version != VERSION) + (zero != 0) > 1:
+    feed = FEEDS.get(kind)
+    if data[:4] in _FILES or (feed is None) + (version != VERSION) + (zero != 0) > 1:
         raise PacketError(f"{_FILES.get(data[:4], 'no header (raw PCM?)')}: {_SOUND_IS}")
     if version != VERSION:
         raise PacketError(f"a message of version {version}, not {VERSION}")
-    if kind not in FEEDS.values() or zero:
-        raise PacketError(f"a message of kind {kind}, which a robot is not sent ({', '.join(FEEDS)})")
+    if feed is None or zero:
+        raise PacketError(f"a message of kind {kind}, which a robot is not sent ({', '.join(FEEDS.values())})")
     if not (math.isfinite(sent_s) and math.isfinite(at_s)):
         raise PacketError("a time that is not finite")
     if at_s and not sent_s:
@@ -125,7 +128,7 @@ def parse_message(data: bytes) -> Message:
     if rest[:4] in _FILES:
         raise PacketError(f"{_FILES[rest[:4]]} behind the header: send its samples alone")
     samples = np.frombuffer(rest, dtype="<i2").astype(np.int16)
-    return SoundMessage(kind=kind, rate_hz=rate_hz, sent_s=sent_s, at_s=at_s, samples=samples)
+    return SoundMessage(feed=feed, rate_hz=rate_hz, sent_s=sent_s, at_s=at_s, samples=samples)
 
 
 def _json(data: bytes) -> Hello | Hush:
@@ -162,3 +165,33 @@ def sound_message(kind: int, rate_hz: int, sent_s: float, at_s: float, samples: 
 def json_message(**values: Any) -> bytes:
     """Return a JSON message."""
     return json.dumps(values, allow_nan=False).encode()
+
+
+class SenderClock:
+    """The clock of a program that sends, in ours.
+
+    Every message says when it was sent, by a clock of any origin. The message of the last seconds that took least time
+    on its way tells where that clock stands: its delay is taken as none. So a time is late by the shortest delay of the
+    way, and never early; a clock that drifts is followed. Holds the least `arrived - sent` of two windows.
+    """
+
+    def __init__(self) -> None:
+        self._began_s = 0.0
+        self._now_least: float | None = None
+        self._last_least: float | None = None
+
+    def observe(self, sent_s: float, arrived_s: float) -> None:
+        """Take in a message that arrived at `arrived_s` of `time.monotonic`."""
+        took = arrived_s - sent_s
+        if self._now_least is None or took > self.offset_s + _SET_S:
+            self._began_s, self._now_least, self._last_least = arrived_s, took, None
+        elif arrived_s - self._began_s > _WINDOW_S:
+            self._began_s, self._last_least, self._now_least = arrived_s, self._now_least, took
+        else:
+            self._now_least = min(self._now_least, took)
+
+    @property
+    def offset_s(self) -> float:
+        """Seconds to add to a time of the sender. 0 before the first message."""
+        known = [each for each in (self._now_least, self._last_least) if each is not None]
+        return min(known, default=0.0)

@@ -29,14 +29,13 @@ from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.sources.live_face import LiveFace
 from sfms_robot.sources.live_voice import Clock, SourcePart
 from sfms_robot.sources.net_messages import (
-    FEEDS,
     MICROPHONE,
     VERSION,
-    VOICE,
     Hello,
     Hush,
     Message,
     SeenMessage,
+    SenderClock,
     SoundMessage,
     json_message,
     parse_message,
@@ -53,42 +52,10 @@ FLAGS: Final = {"voice": "--audio push", "face": "--face push", "speech": "--age
 
 OLDEST_S: Final = 1.0  # of a voice or a face that is still of use
 _OLD: Final = f"its time (`at`) is more than {OLDEST_S:g} s ago, by the sender's clock"
-_WINDOW_S: Final = 10.0  # that a clock is remembered, once or twice
-_SET_S: Final = 1.0  # a message that took so much longer than the quickest: the clock was set
 _SPARE_S: Final = 2.0  # of sound, that may arrive faster than time passes
 
 _open: dict[tuple[str, int], NetPerson] = {}
 _opening: Final = threading.Lock()
-
-
-class SenderClock:
-    """The clock of a program that sends, in ours.
-
-    Every message says when it was sent, by a clock of any origin. The message of the last seconds that took least time
-    on its way tells where that clock stands: its delay is taken as none. So a time is late by the shortest delay of the
-    way, and never early; a clock that drifts is followed. Holds the least `arrived - sent` of two windows.
-    """
-
-    def __init__(self) -> None:
-        self._began_s = 0.0
-        self._now_least: float | None = None
-        self._last_least: float | None = None
-
-    def observe(self, sent_s: float, arrived_s: float) -> None:
-        """Take in a message that arrived at `arrived_s` of `time.monotonic`."""
-        took = arrived_s - sent_s
-        if self._now_least is None or took > self.offset_s + _SET_S:
-            self._began_s, self._now_least, self._last_least = arrived_s, took, None
-        elif arrived_s - self._began_s > _WINDOW_S:
-            self._began_s, self._last_least, self._now_least = arrived_s, self._now_least, took
-        else:
-            self._now_least = min(self._now_least, took)
-
-    @property
-    def offset_s(self) -> float:
-        """Seconds to add to a time of the sender. 0 before the first message."""
-        known = [each for each in (self._now_least, self._last_least) if each is not None]
-        return min(known, default=0.0)
 
 
 class Intake:
@@ -107,11 +74,15 @@ class Intake:
     def hear(self, voice: PushedVoice, message: SoundMessage, clock: SenderClock) -> str | None:
         """Hand on the next piece of their voice; return why it was left out, or what is wrong. Never blocks."""
         now_s, at_s, old = self._times(message, clock)
-        piece_s = len(message.samples) / message.rate_hz
         if old:
             return f"voice left out: {_OLD}"
-        if not self._in_time(piece_s, now_s):
+        piece_s = len(message.samples) / message.rate_hz
+        self._spare_s = min(_SPARE_S, self._spare_s + (now_s - self._spared_s))
+        self._spared_s = now_s
+        if piece_s > self._spare_s:
+            self.counts["too_fast"] += 1
             return f"voice left out: {piece_s:.2g} s came faster than time passes; send it as it is recorded"
+        self._spare_s -= piece_s
         voice.hear(message.samples, message.rate_hz, at_s)
         return voice.pace.problem
 
@@ -137,19 +108,9 @@ class Intake:
         self.counts["old"] += old
         return now_s, None if at_s is None else min(at_s, now_s), old
 
-    def _in_time(self, piece_s: float, now_s: float) -> bool:
-        """Return whether no more sound came than time has passed, and a little."""
-        self._spare_s = min(_SPARE_S, self._spare_s + (now_s - self._spared_s))
-        self._spared_s = now_s
-        if piece_s > self._spare_s:
-            self.counts["too_fast"] += 1
-            return False
-        self._spare_s -= piece_s
-        return True
 
-
-class NetPerson:
-    """The server's handler: which program feeds what, and which are sent what.
+class NetPerson(NetServer):
+    """The programs beside a run: which of them feeds what, and which are sent what.
 
     Attributes:
         now: `time.monotonic`, or a test's.
@@ -157,62 +118,55 @@ class NetPerson:
     """
 
     def __init__(self, flag: str, host: str, port: int, now: Clock = time.monotonic) -> None:
+        super().__init__(flag, host, port)
         self.now = now
         self._place = (host, port)
         self._feeds: dict[str, _NetPart] = {}
-        self._feeders: dict[str, NetProgram] = {}
-        self._clocks: dict[NetProgram, SenderClock] = {}
-        self._heard_s: dict[str, float] = {}
         self._origin_s = 0.0
         self._state: Mapping[str, Any] | None = None
         self._intake = Intake(now)
-        self._server = NetServer(flag, host, port, self)
         self.token = None if is_loopback(self.address[0]) else secrets.token_urlsafe(12)
         at = address_text(*self.address)
         logger.warning(
             "%s: tcp://%s and ws://%s%s", flag, at, at, "" if self.token is None else f", token {self.token}"
         )
 
-    @property
-    def address(self) -> tuple[str, int]:
-        """Host and port that are bound."""
-        return self._server.address
-
     # --- from the run, in its threads ---
 
-    def join(self, name: str, part: _NetPart) -> None:
-        """Give `part` what programs feed as `name`. Raises PortError when another one takes it already."""
-        if name in self._feeds:
-            raise PortError(f"{FLAGS[name]}: port {self.address[1]} is used by another run of this program")
-        self._feeds[name] = part
+    def join(self, part: _NetPart) -> None:
+        """Give `part` what programs feed as its `feed`. Raises PortError when another one takes it already."""
+        if part.feed in self._feeds:
+            raise PortError(f"{FLAGS[part.feed]}: port {self.address[1]} is used by another run of this program")
+        self._feeds[part.feed] = part
 
-    def leave(self, name: str) -> None:
+    def leave(self, part: _NetPart) -> None:
         """Take a part away; the last one closes the server. Blocks until it is closed."""
         with _opening:
-            self._feeds.pop(name, None)
+            self._feeds.pop(part.feed, None)
             if not self._feeds:
                 _open.pop(self._place, None)
-                self._server.close()
+                self.close()
 
-    def start(self, origin_s: float) -> None:
+    def begin(self, origin_s: float) -> None:
         """Set loop time 0 to `origin_s` of `time.monotonic`. From now on programs are answered."""
         self._origin_s = origin_s
-        self._server.start()
+        self.start()
 
     def hears(self, audio: Floats, time_s: float) -> None:
         """Send what the run hears, (640,), whose newest sample is of loop time `time_s`. Never blocks."""
         at_s = self._origin_s + time_s
-        self._server.post(lambda: self._send_sound(audio, at_s))
+        self.post(lambda: self._send_sound(audio, at_s))
 
     def tells(self, kind: str, time_s: float, **values: Any) -> None:
         """Send an event, or a state, that begins at loop time `time_s`. Never blocks."""
         event = {"type": kind, "at_s": round(self._origin_s + time_s, 4), **values}
-        self._server.post(lambda: self._send_event(event))
+        self.post(lambda: self._send_event(event))
 
     def statistics(self) -> Mapping[str, Any]:
         """Return the server's counts, sound and faces that were too late or too fast, and which program feeds what."""
-        feeders = {name: connection.name for name, connection in self._feeders.copy().items()}
-        return {**self._server.counts, **self._intake.counts, "feeders": feeders}
+        feeders = {name: part.feeder for name, part in self._feeds.copy().items()}
+        named = {name: feeder.name for name, feeder in feeders.items() if feeder is not None}
+        return {**self.counts, **self._intake.counts, "feeders": named}
 
     # --- from programs, in the server's thread ---
 
@@ -223,34 +177,30 @@ class NetPerson:
             return
         if not connection.greeted:
             raise PacketError("the first message must be a hello")
-        name = next(name for name, kind in FEEDS.items() if kind == message.kind)
-        if self._feeders.get(name) is not connection:
-            raise PacketError(f"{name} was not announced in its hello")
-        self._heard_s[name] = self.now()
-        clock, problem = self._clocks[connection], None
-        match self._feeds[name], message:
+        part, problem = self._feeds.get(message.feed), None
+        if part is None or part.feeder is not connection:
+            raise PacketError(f"{message.feed} was not announced in its hello")
+        part.heard_s = self.now()
+        match part, message:
             case NetSpeech() as speech, Hush():
                 speech.hush()
             case NetSpeech() as speech, SoundMessage() as sound:
-                speech.say(sound.samples, sound.rate_hz, self._intake.at_s(sound, clock))
+                speech.say(sound.samples, sound.rate_hz, self._intake.at_s(sound, connection.clock))
             case NetSight() as sight, SeenMessage() as seen:
-                problem = self._intake.see(sight, seen, clock)
+                problem = self._intake.see(sight, seen, connection.clock)
             case NetVoice() as voice, SoundMessage() as sound:
-                problem = self._intake.hear(voice, sound, clock)
+                problem = self._intake.hear(voice, sound, connection.clock)
         if problem is not None:
             connection.tell_once(problem)
 
     def gone(self, connection: NetProgram) -> None:
         """Free the places of a program that has gone."""
-        self._clocks.pop(connection, None)
-        for name in [each for each, feeder in self._feeders.items() if feeder is connection]:
-            del self._feeders[name]
-            logger.info("%s: %s has gone", FLAGS[name], connection.name)
-            part = self._feeds.get(name)
-            if part is not None and name != "speech":  # a program with nothing to say is no loss
-                part.lost = True
-            if isinstance(part, NetSight):
-                part.see(None)
+        for name, part in self._feeds.copy().items():
+            if part.feeder is connection:
+                part.feeder, part.lost = None, name != "speech"  # a program with nothing to say is no loss
+                logger.info("%s: %s has gone", FLAGS[name], connection.name)
+                if isinstance(part, NetSight):
+                    part.see(None)
 
     def _greet(self, connection: NetProgram, hello: Hello) -> None:
         if connection.greeted:
@@ -262,28 +212,28 @@ class NetPerson:
         for name in sorted(hello.feeds):
             self._claim(connection, name)
         for name in hello.feeds:
-            self._feeders[name], self._heard_s[name] = connection, self.now()
-            self._feeds[name].lost = False
+            part = self._feeds[name]
+            part.feeder, part.heard_s, part.lost = connection, self.now(), False
             logger.info("%s: %s", FLAGS[name], connection.name)
-        self._clocks[connection] = SenderClock()
         connection.greeted, connection.wants = True, hello.wants
         connection.send(json_message(type="welcome", version=VERSION, sent_s=self.now(), takes=sorted(self._feeds)))
         if self._state is not None and "events" in hello.wants:
             connection.send(json_message(**self._state, sent_s=self.now()))
 
     def _claim(self, connection: NetProgram, name: str) -> None:
-        if name not in self._feeds:
+        part = self._feeds.get(name)
+        if part is None:
             raise PacketError(f"this run takes no {name} from programs ({FLAGS[name]})")
-        feeder = self._feeders.get(name)
+        feeder = part.feeder
         if feeder is None:
             return
-        if name == "speech" or self.now() - self._heard_s[name] < SILENT_S:
+        if name == "speech" or self.now() - part.heard_s < SILENT_S:
             raise PacketError(f"{name} comes from {feeder.name} already")
-        del self._feeders[name]
+        part.feeder = None
         feeder.end(f"{name} now comes from {connection.name}: none came for {SILENT_S:g} s")
 
     def _wanting(self, what: str) -> list[NetProgram]:
-        return [each for each in self._server.connections if what in each.wants]
+        return [each for each in self.connections if what in each.wants]
 
     def _send_sound(self, audio: Floats, at_s: float) -> None:
         if wanting := self._wanting("microphone"):
@@ -303,24 +253,30 @@ class _NetPart(SourcePart):
     """A part of a person that another program feeds: it joins the server, which runs from its start to its close.
 
     argument: [HOST:]PORT, "" for the usual one; raises ConfigError, PortError. Or a server that runs already.
+
+    Attributes:
+        feeder: the program that feeds it; None: none does.
+        heard_s: when that sent something last, of `time.monotonic`.
     """
 
     feed: ClassVar[str]
+    feeder: NetProgram | None = None
+    heard_s = 0.0
 
     def __init__(self, argument: str | NetPerson) -> None:
         self.outlet = _person(FLAGS[self.feed], argument) if isinstance(argument, str) else argument
         super().__init__(self.outlet.now)
-        self.outlet.join(self.feed, self)
+        self.outlet.join(self)
 
     def start(self, origin_s: float) -> None:
-        self.outlet.start(origin_s)
+        self.outlet.begin(origin_s)
         super().start(origin_s)
 
     def statistics(self) -> Mapping[str, Any]:
         return {**super().statistics(), "net": self.outlet.statistics()}
 
     def close(self) -> None:
-        self.outlet.leave(self.feed)
+        self.outlet.leave(self)
 
 
 class NetVoice(_NetPart, PushedVoice):
@@ -378,29 +334,22 @@ class PageVisitor:
             if number != self._number:
                 self._clock = SenderClock()
                 self.sight.forget()
-            self._number, before, self._feeds = number, self._feeds, frozenset(feeds)
-            self._lose(before - self._feeds)
-            self.voice.lost = self.voice.lost and "voice" not in feeds
-            self.sight.lost = self.sight.lost and "face" not in feeds
+            self._set(number, frozenset(feeds))
 
     def gone(self, number: int) -> None:
         """Note that visitor `number` has gone, or has lost the controls."""
         with self._lock:
             if number == self._number:
-                before, self._number, self._feeds = self._feeds, None, frozenset()
-                self._lose(before)
+                self._set(None, frozenset())
 
     def received(self, number: int, data: bytes) -> None:
         """Take a message of `net_messages`. Raises PacketError for any other, and for one that was not announced."""
         with self._lock:
             message = parse_message(data)
-            if not isinstance(message, (SoundMessage, SeenMessage)) or (
-                isinstance(message, SoundMessage) and message.kind != VOICE
-            ):
+            if isinstance(message, Hello | Hush) or message.feed == "speech":
                 raise PacketError("only voice and face are taken from a visitor")
-            name = "voice" if isinstance(message, SoundMessage) else "face"
-            if number != self._number or name not in self._feeds:
-                raise PacketError(f"{name} was not announced by `source`")
+            if number != self._number or message.feed not in self._feeds:
+                raise PacketError(f"{message.feed} was not announced by `source`")
             if isinstance(message, SoundMessage):
                 self._intake.hear(self.voice, message, self._clock)
             else:
@@ -410,12 +359,13 @@ class PageVisitor:
         """Return counts of messages that came too late, and of sound that came faster than time passes."""
         return dict(self._intake.counts)
 
-    def _lose(self, feeds: frozenset[str]) -> None:
-        if "voice" in feeds:
-            self.voice.lost = True
+    def _set(self, number: int | None, feeds: frozenset[str]) -> None:
+        if "voice" in self._feeds - feeds:
             self.voice.interrupt()
-        if "face" in feeds:
-            self.sight.lost = True
+        for feed, part in (("voice", self.voice), ("face", self.sight)):
+            if feed in self._feeds | feeds:
+                part.lost = feed not in feeds
+        self._number, self._feeds = number, feeds
 
 
 class BrowserVoice(PushedVoice):

@@ -25,16 +25,16 @@ import sys
 from collections import deque
 from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing, suppress
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from websockets.exceptions import InvalidHandshake, WebSocketException
 from websockets.frames import CloseCode, Frame, Opcode
 from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
-from sfms_robot.endpoint import ServerThread, address_text, listen, origin_problem
+from sfms_robot.endpoint import ServerThread, address_text, origin_problem
 from sfms_robot.errors import PacketError
-from sfms_robot.sources.net_messages import LONGEST, Message, json_message, parse_message
+from sfms_robot.sources.net_messages import LONGEST, Message, SenderClock, json_message, parse_message
 
 logger = logging.getLogger(__name__)
 
@@ -55,37 +55,37 @@ _LENGTH: Final = struct.Struct("<I")
 _REASON: Final = 120  # bytes of a closing frame's text
 
 
-class Handler(Protocol):
-    """Decides what messages mean. Called in the server's thread."""
-
-    def received(self, connection: NetProgram, message: Message) -> None:
-        """Raise PacketError for a message that this connection may not send: it is closed with that line."""
-
-    def gone(self, connection: NetProgram) -> None:
-        """Note that a connection is closed, or about to be. Idempotent."""
-
-
 class NetServer(ServerThread):
     """Holds one address from construction until `close`; clients wait until `start`. Raises PortError.
+
+    A subclass decides what messages mean.
 
     Args:
         flag: the option that names the address, for errors.
         port: 0: any that is free.
 
     Attributes:
-        address: host and port that are bound.
         counts: connections, refused ones, messages, malformed ones, and messages that slow readers missed.
         connections: those that are open; for the server's thread.
     """
 
-    def __init__(self, flag: str, host: str, port: int, handler: Handler) -> None:
+    def __init__(self, flag: str, host: str, port: int) -> None:
         self.counts = dict.fromkeys(("connections", "refused", "messages", "malformed", "missed"), 0)
-        self.handler = handler
         self.connections: set[NetProgram] = set()
         self._said: set[str] = set()
-        super().__init__(listen(flag, host, port), "net", _STOP_S)
-        self.address: tuple[str, int] = self._socket.getsockname()[:2]
+        super().__init__(flag, host, port, _STOP_S)
         self._posted: deque[Callable[[], None]] = deque(maxlen=4 * OUTBOX)
+
+    def received(self, connection: NetProgram, message: Message) -> None:
+        """Take a message, in the server's thread.
+
+        Raises PacketError for one that this connection may not send: it is closed with that line.
+        """
+        raise NotImplementedError
+
+    def gone(self, connection: NetProgram) -> None:
+        """Note, in the server's thread, that a connection is closed, or about to be. Idempotent."""
+        raise NotImplementedError
 
     def post(self, work: Callable[[], None]) -> None:
         """Have `work` called in the server's thread; the oldest is dropped when too much waits. Never blocks."""
@@ -130,12 +130,13 @@ class NetProgram:
         name: what it calls itself, and its address.
         greeted: its hello was accepted.
         malformed: count of its messages that could not be read.
+        clock: in which it says when it sent them.
         wants: what it is sent.
     """
 
     def __init__(self, server: NetServer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.name = address_text(*writer.get_extra_info("peername", ("an unknown address", 0))[:2])
-        self.greeted, self.malformed = False, 0
+        self.greeted, self.malformed, self.clock = False, 0, SenderClock()
         self._told: set[str] = set()
         self.wants: frozenset[str] = frozenset()
         self._server, self._reader, self._writer = server, reader, writer
@@ -164,14 +165,12 @@ class NetProgram:
         except (OSError, asyncio.IncompleteReadError):
             pass  # it has gone
         except PacketError as error:
-            server.counts["malformed"] += 1
-            server.say_once(f"wire {error}", f"{self.name}: closed: {error}")
-            self.end(str(error))
+            self._fault("malformed", "closed", str(error))
         finally:
             deadline.cancel()
             sending.cancel()
             server.connections.discard(self)
-            server.handler.gone(self)  # once more where it was ended here
+            server.gone(self)  # once more where it was ended here
             self._writer.close()
 
     def send(self, message: bytes) -> None:
@@ -197,7 +196,7 @@ class NetProgram:
         if self._over:
             return
         self._over = True
-        self._server.handler.gone(self)
+        self._server.gone(self)
         if self._wire is not None:
             for message in (*self._outbox, json_message(type="error", error=reason)):
                 self._writer.write(self._wire.packed(message))
@@ -236,32 +235,31 @@ class NetProgram:
                     await asyncio.sleep(TURN_S * len(self._server.connections))
 
     def _take(self, data: bytes) -> None:
-        server = self._server
-        server.counts["messages"] += 1
+        self._server.counts["messages"] += 1
         try:
             message = parse_message(data)
         except PacketError as error:
             self.malformed += 1
-            closes = not self.greeted or self.malformed > MOST_MALFORMED
-            if not closes:
-                self.tell(str(error))
-            server.counts["malformed"] += 1
-            server.say_once(f"malformed {error}", f"{self.name}: left out: {error}")
-            if closes:
-                self.end(str(error))
+            ends = not self.greeted or self.malformed > MOST_MALFORMED
+            self._fault("malformed", "left out", str(error), ends)
             return
         try:
-            server.handler.received(self, message)
+            self._server.received(self, message)
         except PacketError as error:
-            server.counts["refused"] += 1
-            server.say_once(f"refused {error}", f"{self.name}: refused: {error}")
-            self.end(str(error))
+            self._fault("refused", "refused", str(error))
 
     def _silent(self) -> None:
         if not self.greeted:
-            self._server.counts["refused"] += 1
-            self._server.say_once("silent", f"{self.name}: closed: no hello within {HELLO_S:g} s")
-            self.end(f"no hello within {HELLO_S:g} s")
+            self._fault("refused", "closed", f"no hello within {HELLO_S:g} s")
+
+    def _fault(self, count: str, done: str, reason: str, ends: bool = True) -> None:
+        """Tell it what is wrong, count and log that, and close it where it `ends`."""
+        if not ends:
+            self.tell(reason)
+        self._server.counts[count] += 1
+        self._server.say_once(f"{done} {reason}", f"{self.name}: {done}: {reason}")
+        if ends:
+            self.end(reason)
 
 
 class TcpWire:

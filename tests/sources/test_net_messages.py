@@ -9,18 +9,19 @@ from net_program import HEADER, face_message
 from sfms_robot.errors import PacketError
 from sfms_robot.sources.net_messages import (
     FACE,
+    FEEDS,
     LONGEST,
     SPEECH,
     VOICE,
     Hello,
     Hush,
     SeenMessage,
+    SenderClock,
     SoundMessage,
     json_message,
     parse_message,
     sound_message,
 )
-from sfms_robot.sources.net_person import SenderClock
 
 TIMES = st.floats(allow_nan=False, allow_infinity=False, min_value=1e-3)
 HELLO = json_message(type="hello", version=1, feeds=["speech"], wants=["events"])
@@ -30,7 +31,7 @@ HELLO = json_message(type="hello", version=1, feeds=["speech"], wants=["events"]
 def test_sound_is_read_as_it_was_written(kind, rate_hz, sent_s, at_s, values):
     told = parse_message(sound_message(kind, rate_hz, sent_s, at_s, np.array(values, np.int16)))
     assert isinstance(told, SoundMessage)
-    assert (told.kind, told.rate_hz, told.sent_s, told.at_s) == (kind, rate_hz, sent_s, at_s)
+    assert (told.feed, told.rate_hz, told.sent_s, told.at_s) == (FEEDS[kind], rate_hz, sent_s, at_s)
     assert told.samples.dtype == np.int16 and told.samples.tolist() == values
 
 

@@ -194,6 +194,13 @@ def test_programs_that_ask_are_told_what_is_heard_and_done(run, Program):
     all_looked_at(other)
 
 
+def test_a_part_that_was_closed_is_fed_no_more(run):
+    program = joined(Tcp(run, feeds=["voice", "speech"]))
+    run.speech.close()
+    program.send(sound_message(SPEECH, 16000, 7.0, 0.0, SECOND))
+    assert last_words(program) == "speech was not announced in its hello"
+
+
 def test_a_second_feeder_is_refused_by_name_and_said_once(run, caplog):
     first = joined(Tcp(run, feeds=["voice", "speech"], name="booth"))
     port = first.socket.getsockname()[1]
