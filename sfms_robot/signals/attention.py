@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import BLINKS, YAW_PITCH, Doubles, FaceFrame, Floats
-from sfms_robot.signals.gaze_kinematics import EYE_PAN_RAD, EYE_TILT_RAD, direction_to, directions
+from sfms_robot.signals.gaze_kinematics import EYES_RAD, direction_to, directions
 
 HALF_RAD: Final = math.radians(10.0)  # attention 0.5: about twice what a gaze from a face tracker scatters
 SLOPE_RAD: Final = math.radians(2.0)
@@ -30,7 +30,6 @@ NEUTRAL_START_RAD_S: Final = math.radians(6.0)
 NEUTRAL_RAD_S: Final = math.radians(0.3)
 SETTLE_S: Final = 4.0
 FORGET_S: Final = 10.0  # a face after so long is another person
-_FULL_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,15 +54,11 @@ class AttentionState:
     turns: bool = False
 
 
-def attend(
-    face: FaceFrame | None, place_m: Floats | None, state: AttentionState
-) -> tuple[float | None, AttentionState]:
+def attend(face: FaceFrame, place_m: Floats | None, state: AttentionState) -> tuple[float | None, AttentionState]:
     """Return the attention (0..1) of a face, None if unknown, and the state after it.
 
     `place_m` (3,): see `frames.Sighting`. A face that is not newer than the last one changes nothing.
     """
-    if face is None:
-        return None, state
     if state.time_s is not None and face.time_s <= state.time_s:
         return state.attention if state.turns else None, state
     first = state.time_s is None or face.time_s - state.time_s > FORGET_S
@@ -71,7 +66,7 @@ def attend(
     dt_s = 0.0 if before.time_s is None else face.time_s - before.time_s
     motion = face.motion
     closed = float(motion[BLINKS].mean()) > CLOSED
-    eyes_rad = before.eyes_rad if closed else directions(motion, _FULL_RAD).mean(axis=0)
+    eyes_rad = before.eyes_rad if closed else directions(motion, EYES_RAD).mean(axis=0)
     gaze_rad = motion[YAW_PITCH] + eyes_rad
     if place_m is not None:  # a person at the camera's left turns to their own left, and one above it looks down
         gaze_rad = gaze_rad - direction_to(np.asarray(place_m, np.float64)) * [1.0, -1.0]
@@ -83,7 +78,7 @@ def attend(
         seen_s, open_s = seen_s + dt_s, face.time_s
     looks = _at(float(np.hypot(*(gaze_rad - neutral_rad)))) if face.time_s - open_s <= BLINK_S else 0.0
     attention = looks if first else looks + (before.attention - looks) * math.exp(-dt_s / SMOOTH_S)
-    turns = before.turns or bool(motion[YAW_PITCH].any() or directions(motion, _FULL_RAD).any())
+    turns = before.turns or bool(motion[YAW_PITCH].any() or directions(motion, EYES_RAD).any())
     after = AttentionState(
         time_s=face.time_s,
         seen_s=seen_s,

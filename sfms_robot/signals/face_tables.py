@@ -67,7 +67,7 @@ def csv_cells(file: Path) -> Table:
         if text.lstrip()[:1] in ("[", "{"):
             return _json_table(file, text)
         mark = max(_DIVIDERS, key=text.lstrip().partition("\n")[0].count)
-        rows = [row for row in csv.reader(io.StringIO(text), delimiter=mark) if row]
+        rows = [[cell.strip() for cell in row] for row in csv.reader(io.StringIO(text), delimiter=mark) if row]
         if mark != ",":  # of a country in which 0,5 is a half
             rows = [[cell.replace(",", ".") for cell in row] for row in rows]
     except FileNotFoundError:
@@ -76,7 +76,7 @@ def csv_cells(file: Path) -> Table:
         raise ConfigError(f"{file}: cannot be read as a CSV text: {error}") from error
     if len(rows) < 2:
         raise ConfigError(f"{file}: holds no rows: " + ("only a header" if rows else "the file is empty"))
-    return [cell.strip() for cell in rows[0]], rows[1:]
+    return rows[0], rows[1:]
 
 
 def csv_numbers(file: Path, column: str, cells: Iterable[str]) -> Doubles:

@@ -29,6 +29,7 @@ from sfms_robot.signals.minimum_jerk import ease, minimum_jerk
 
 EYE_PAN_RAD: Final = math.radians(30)  # of an eyeLook channel of 1, sideways
 EYE_TILT_RAD: Final = math.radians(20)
+EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])
 # Columns of a motion row that are the eyes' here.
 EYE_CHANNELS: Final = tuple(
     CHANNEL_INDEX[f"eyeLook{way}{side}"] for side in ("Left", "Right") for way in ("Down", "In", "Out", "Up")

@@ -65,21 +65,22 @@ def _mel(hz: Doubles | float) -> Doubles:
     return 2595.0 * np.log10(1.0 + np.asarray(hz, dtype=np.float64) / 700.0)
 
 
-def triangles(edges: Doubles, places: Doubles) -> Doubles:
-    """Return filters (K, N) at `places` (N,): each rises to 1 and falls to 0 over three of the edges (K + 2,)."""
+def triangles(edges: Doubles, places: Doubles, least: float = 0.0) -> Doubles:
+    """Return filters (K, N) at `places` (N,): each rises to 1 and falls to 0 over three of the edges (K + 2,).
+
+    `least`: width of each side.
+    """
     low, centre, high = edges[:-2, None], edges[1:-1, None], edges[2:, None]
-    return np.maximum(0.0, np.minimum((places - low) / (centre - low), (high - places) / (high - centre)))
+    rise = (places - centre) / np.maximum(centre - low, least) + 1.0
+    fall = (centre - places) / np.maximum(high - centre, least) + 1.0
+    return np.maximum(0.0, np.minimum(rise, fall))
 
 
 def _filters() -> Doubles:
     """(128, 257) triangles equally spaced in mel, each at least one FFT bin wide so that none is empty."""
     edges_hz = 700.0 * (10 ** (np.linspace(_mel(20.0), _mel(AUDIO_HZ / 2), MEL_BINS + 2) / 2595.0) - 1.0)
     bins_hz = np.linspace(0, AUDIO_HZ / 2, FFT // 2 + 1)
-    step = bins_hz[1]
-    low, centre, high = edges_hz[:-2, None], edges_hz[1:-1, None], edges_hz[2:, None]
-    rise = (bins_hz - centre) / np.maximum(centre - low, step) + 1.0
-    fall = (centre - bins_hz) / np.maximum(high - centre, step) + 1.0
-    return np.asarray(np.clip(np.minimum(rise, fall), 0.0, None))
+    return triangles(edges_hz, bins_hz, float(bins_hz[1]))
 
 
 _HANN: Final = np.hanning(WINDOW + 1)[:-1]

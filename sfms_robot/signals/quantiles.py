@@ -51,18 +51,15 @@ class Quantiles:
         if percent >= 100.0:
             return self._largest
         place = int(np.searchsorted(np.cumsum(self._bins), percent / 100.0 * self._count, side="left"))
-        return min(_middle(place), self._largest)
+        middle = _LEAST * _RATIO ** (place - 0.5) if place else 0.0
+        return min(middle, self._largest)
 
-    def report(self, **percent: float) -> dict[str, float | None]:
-        """{"p50": ..., ...} to three digits after the point; every value None when nothing was taken."""
-        if not self._count:
-            return dict.fromkeys(percent)
-        return {name: round(self.at(each), 3) for name, each in percent.items()}
+    def report(self, *percents: int) -> dict[str, float | None]:
+        """{"p50": ..., "max": ...} to three digits after the point; every value None when nothing was taken."""
+        return {
+            "max" if each == 100 else f"p{each}": round(self.at(each), 3) if self._count else None for each in percents
+        }
 
 
 def _bin(value: float) -> int:
     return 0 if value < _LEAST else min(_BINS - 1, 1 + int(math.log(value / _LEAST) / math.log(_RATIO)))
-
-
-def _middle(place: int) -> float:
-    return 0.0 if place == 0 else _LEAST * _RATIO ** (place - 0.5)

@@ -110,14 +110,14 @@ def read_track(path: Path | str) -> Track:
         header, rows = from_openface(file, header, rows)
         time_at = 0
     columns, from_camera = _columns(file, header)
-    times_s = row_times(file, header[time_at], [row[time_at].strip() for row in rows])
+    times_s = row_times(file, header[time_at], [row[time_at] for row in rows])
     once = np.diff(times_s, prepend=-np.inf) > 0
     if not once.all():
         logger.warning("%s: rows with the time of the row before are left out: %d", file, (~once).sum())
 
     motion = np.zeros((len(rows), MOTION_DIM))
     for channel, column in columns.items():
-        cells = [row[column.place].strip() for row in rows]
+        cells = [row[column.place] for row in rows]
         lost = [cell == "" or cell.lower() == "nan" for cell in cells]
         values = np.where(lost, np.nan, csv_numbers(file, header[column.place], np.where(lost, "0", cells)))
         motion[:, CHANNEL_INDEX[channel]] = values if math.isnan(column.factor) else column.factor * values
@@ -245,7 +245,7 @@ def _check_ranges(file: Path, header: Sequence[str], rows: _Rows, motion: Double
     if outside:
         row, place = outside[0]
         column = columns[CHANNELS[place]].place
-        cell, unit = rows[row][column].strip(), "" if place > 5 else "; a name such as yaw_deg, x_cm has its unit"
+        cell, unit = rows[row][column], "" if place > 5 else "; a name such as yaw_deg, x_cm has its unit"
         raise ConfigError(
             f"{file}: row {row + 2}, column {header[column]}: expected {expected_unit(place)}, got {cell}{unit}"
         )
@@ -261,7 +261,8 @@ class Take:
 
 def face_stretches(file: Path, name: str) -> list[Take]:
     """Return the stretches of a face track in which a face was seen. Raises ConfigError."""
-    return stretches(resample(read_track(file), FRAME_HZ).motion, name)
+    motion = resample(read_track(file), FRAME_HZ).motion
+    return [Take(name, motion[first:end]) for first, end in runs(np.isfinite(motion).all(axis=1))]
 
 
 def folder_takes(folder: Path) -> list[Take]:
@@ -273,8 +274,3 @@ def folder_takes(folder: Path) -> list[Take]:
     if not files:
         raise ConfigError(f"--data {str(folder)!r}: no face tracks (*.csv, *.csv.gz) below it")
     return [take for file in files for take in face_stretches(file, str(file.relative_to(folder)))]
-
-
-def stretches(motion: Floats, name: str) -> list[Take]:
-    """Return the parts of `motion` (N, 58) without gaps (rows that are not finite)."""
-    return [Take(name, motion[first:end]) for first, end in runs(np.isfinite(motion).all(axis=1))]

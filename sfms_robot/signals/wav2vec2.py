@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from sfms_robot.errors import ModelError, optional
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats, Indices
 
 CONTEXT_FRAMES: Final = 50
 STRIDE: Final = 320  # samples a latent
@@ -79,8 +79,7 @@ class Wav2Vec2:
         hops = max(0, (len(seen) - self._window) // self._hop + 1)
         if not hops:
             return np.zeros((0, self.dim), np.float32), seen
-        windows = np.lib.stride_tricks.sliding_window_view(seen, self._window)[:: self._hop][:hops]
-        return self._rows(windows), seen[hops * self._hop :].copy()
+        return self._rows(seen, self._hop * np.arange(hops)), seen[hops * self._hop :].copy()
 
     def of_recording(self, samples: Floats, fps: float = FRAME_HZ) -> Floats:
         """Return the rows (frames, dim) of a whole recording.
@@ -88,24 +87,21 @@ class Wav2Vec2:
         At 25 fps those of a stream; a last hop that is not complete ends in silence. At other rates windows end with
         their frame, which takes a hop of one: raises ValueError for others.
         """
-        frames = int(len(samples) * fps / AUDIO_HZ + 1e-6)
-        if fps == FRAME_HZ:
-            whole = -(-frames // self.hop_frames) * self._hop
-            return self.step(np.pad(samples, (0, max(0, whole - len(samples))))[:whole], self.start())[0][:frames]
-        if self.hop_frames != 1:
+        if fps != FRAME_HZ and self.hop_frames != 1:
             raise ValueError(f"a hop of {self.hop_frames} frames needs data at {FRAME_HZ} fps, not {fps:g}")
-        if not frames:
-            return np.zeros((0, self.dim), np.float32)
-        ends = np.round(np.arange(1, frames + 1) * AUDIO_HZ / fps).astype(int)
-        seen = np.concatenate([np.zeros(self._window, np.float32), samples])
-        return self._rows(np.lib.stride_tricks.sliding_window_view(seen, self._window)[ends])
+        frames = int(len(samples) * fps / AUDIO_HZ + 1e-6)
+        hops = -(-frames // self.hop_frames)
+        ends = np.round(np.arange(1, hops + 1) * self.hop_frames * AUDIO_HZ / fps).astype(int)
+        seen = np.concatenate([np.zeros(self._window), samples, np.zeros(self._hop)]).astype(np.float32)
+        return self._rows(seen, ends)[:frames]
 
     @torch.no_grad()
-    def _rows(self, windows: Floats) -> Floats:
-        """Return the rows (hops * hop_frames, dim) of windows (hops, window)."""
-        rows = []
-        for at in range(0, len(windows), BATCH):
-            sound = torch.from_numpy(windows[at : at + BATCH].copy()).to(self._device)
+    def _rows(self, samples: Floats, begins: Indices) -> Floats:
+        """Return the rows (hops * hop_frames, dim) of the windows of `samples` (n,) that begin at `begins` (hops,)."""
+        windows = np.lib.stride_tricks.sliding_window_view(samples, self._window)
+        rows = [np.zeros((0, self.dim), np.float32)]
+        for at in range(0, len(begins), BATCH):
+            sound = torch.from_numpy(windows[begins[at : at + BATCH]]).to(self._device)
             if self._normalise:
                 mean = sound.mean(dim=1, keepdim=True)
                 sound = (sound - mean) / (sound.var(dim=1, correction=0, keepdim=True) + 1e-7).sqrt()

@@ -13,12 +13,11 @@ import re
 import socket
 import struct
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 
@@ -110,12 +109,10 @@ class LiveFace(SourcePart):
 
     def __init__(self, signs: Floats | None = None, now: Clock = time.monotonic) -> None:
         super().__init__(now)
-        self._lock = threading.Lock()
         self._signs: Floats = np.ones(len(POSE_CHANNELS), dtype=np.float32) if signs is None else signs
         self._rest = RestingFace()
         self._waiting: deque[tuple[float, Floats, Floats | None]] = deque(maxlen=_WAITING)
         self._sighting: Sighting | None = None
-        self._origin_s = 0.0
 
     def start(self, origin_s: float) -> None:
         """Set loop time 0 to `origin_s` of `time.monotonic`. The person's rest stays known."""
@@ -222,14 +219,6 @@ def _rest(samples: Floats) -> Floats:
 # the first has been silent for `SILENT_S`.
 
 Address = tuple[Any, ...]
-
-
-class Datagram(NamedTuple):
-    """One packet. `time_s`: of `time.monotonic` when it came in, where the system says so; else when it was read."""
-
-    data: bytes
-    sender: Address
-    time_s: float
 
 
 def _bound(kind: str, host: str, port: int) -> socket.socket:
@@ -341,7 +330,7 @@ class UdpSight(LiveFace):
 
     def at(self, time_s: float) -> Sighting | None:
         for packet in self._packets():
-            self.feed(packet)
+            self.feed(*packet)
         now_s = self._origin_s + time_s
         if self._sender is not None and (motion := self._decoder.due(now_s)) is not None:
             self._show(motion, self._heard_s)
@@ -351,31 +340,30 @@ class UdpSight(LiveFace):
             self._hint = None
         return super().at(time_s)
 
-    def feed(self, packet: Datagram) -> None:
-        """Take one packet, of any sender. Never raises."""
+    def feed(self, data: bytes, sender: Address, time_s: float) -> None:
+        """Take one packet, of any sender, that came in at `time_s` of `time.monotonic`. Never raises."""
         self._counts["packets"] += 1
-        known = self._is_sender(packet.sender)
-        # Stamps come from a clock that may be set: time goes forward here.
-        time_s = max(packet.time_s, self._heard_s) if known else packet.time_s
-        if not known:
+        if self._is_sender(sender):
+            time_s = max(time_s, self._heard_s)  # stamps come from a clock that may be set: time goes forward here
+        else:
             if time_s - self._heard_s < SILENT_S:
-                self._refuse(packet.sender)
+                self._refuse(sender)
                 return
             self._sender = self._before = self._other = None
             self._decoder.restart()
         try:
-            motion = self._decoder.decode(packet.data, time_s)
+            motion = self._decoder.decode(data, time_s)
         except PacketError as error:
-            self._leave_out(str(error), packet.sender)
+            self._leave_out(str(error), sender)
             return
         if self._sender is None:
-            logger.info("%s: packets come from %s", self._kind, address_text(*packet.sender[:2]))
+            logger.info("%s: packets come from %s", self._kind, address_text(*sender[:2]))
             self._refusal_said = False
             self._result_s, self._remark_s = time_s, time_s + SILENT_S
             if self._units is not None:
                 self._units.restart()
             self.forget()
-        self._sender, self._heard_s, self._hint = packet.sender, time_s, None
+        self._sender, self._heard_s, self._hint = sender, time_s, None
         if motion is not None:
             self._show(motion, time_s)
         elif self._decoder.blind:
@@ -391,8 +379,11 @@ class UdpSight(LiveFace):
         """Give the port back. Idempotent."""
         self._socket.close()
 
-    def _packets(self) -> Iterator[Datagram]:
-        """Yield what has come in, oldest first, no more than a call may take. Never blocks, never raises."""
+    def _packets(self) -> Iterator[tuple[bytes, Address, float]]:
+        """Yield what has come in as `feed` takes it, oldest first, no more than a call may take.
+
+        Times are those when it came in, where the system says so; else when it was read. Never blocks, never raises.
+        """
         wall_s, now_s = time.time(), time.monotonic()
         for _ in range(PACKETS_PER_CALL):
             try:
@@ -407,7 +398,7 @@ class UdpSight(LiveFace):
             except OSError:  # a network that went down: the next call tries again
                 self._counts["errors"] += 1
                 return
-            yield Datagram(data, sender, now_s - age_s)
+            yield data, sender, now_s - age_s
             if time.monotonic() - now_s > LONGEST_CALL_S:
                 return
 

@@ -64,10 +64,12 @@ class SourcePart:
     latency_s: float = 0.0
 
     def __init__(self, now: Clock = time.monotonic) -> None:
-        self._now = now
+        self._now, self._lock, self._origin_s = now, threading.Lock(), 0.0
 
     def start(self, origin_s: float) -> None:
         """Set loop time 0 to `origin_s` of `time.monotonic`."""
+        with self._lock:
+            self._origin_s = origin_s
 
     def statistics(self) -> Mapping[str, Any]:
         return {}
@@ -263,8 +265,7 @@ class LiveVoice(SourcePart):
 
     def __init__(self, now: Clock = time.monotonic, name: str = "sound") -> None:
         super().__init__(now)
-        self._lock = threading.Lock()
-        self._origin_s: float | None = None
+        self._zero_s: float | None = None  # loop time 0; None: not started
         self.mix = Downmix(name)
         self._rate_hz = 0.0
         self._clock: SampleClock | None = None  # None: the next piece begins a stretch
@@ -284,7 +285,7 @@ class LiveVoice(SourcePart):
     def start(self, origin_s: float) -> None:
         """Set loop time 0 to `origin_s` of `time.monotonic`. Earlier pieces are dropped, but taught the clock."""
         with self._lock:
-            self._origin_s, self._stream, self._next, self._wanted = origin_s, None, 0, 0
+            self._zero_s, self._stream, self._next, self._wanted = origin_s, None, 0, 0
             self._frames.clear()
 
     def push(self, samples: Floats, rate_hz: float, captured_s: float, arrived_s: float | None = None) -> None:
@@ -304,7 +305,7 @@ class LiveVoice(SourcePart):
             mono = np.ascontiguousarray(np.clip(self.mix(finite), -1.0, 1.0))
             self._counts["not_finite"] += not_finite
             self._observe(len(mono), rate_hz, captured_s)
-            if self._origin_s is not None:
+            if self._zero_s is not None:
                 self._resample(mono, captured_s, captured_s if arrived_s is None else arrived_s)
 
     def take(self, index: int) -> Floats | None:
@@ -367,15 +368,15 @@ class LiveVoice(SourcePart):
 
     def _behind(self) -> float:
         """Return by how many samples of the card the stream is behind its place."""
-        assert self._clock is not None and self._origin_s is not None
-        return self._clock.count_at(self._origin_s + self._next / AUDIO_HZ) - self._position
+        assert self._clock is not None and self._zero_s is not None
+        return self._clock.count_at(self._zero_s + self._next / AUDIO_HZ) - self._position
 
     def _place(self, samples: Floats, first: int) -> Floats:
         """Begin a stream at the first of these samples that is not in the past; return the rest of them."""
         import soxr
 
-        assert self._clock is not None and self._origin_s is not None
-        at = (self._clock.time_s(first) - self._origin_s) * AUDIO_HZ
+        assert self._clock is not None and self._zero_s is not None
+        at = (self._clock.time_s(first) - self._zero_s) * AUDIO_HZ
         past = min(len(samples), max(0, math.ceil((self._next - at) * self._rate_hz / AUDIO_HZ)))
         self._counts["late_samples"] += past
         if past < len(samples):
@@ -409,11 +410,9 @@ class LiveVoice(SourcePart):
                 frame = self._frames.setdefault(index, np.zeros(FRAME_SAMPLES, dtype=np.float32))
                 frame[within : within + len(part)] = np.clip(part, -1.0, 1.0)
             if arrived_s is not None and within + len(part) == FRAME_SAMPLES:
-                self._measure((index + 1) * FRAME_S, arrived_s)
-
-    def _measure(self, end_s: float, arrived_s: float) -> None:
-        assert self._origin_s is not None
-        self.latency_s = latency_after(float(arrived_s) - self._origin_s - end_s, self.latency_s)
+                assert self._zero_s is not None
+                late_s = float(arrived_s) - self._zero_s - (index + 1) * FRAME_S
+                self.latency_s = latency_after(late_s, self.latency_s)
 
 
 def latency_after(late_s: float, latency_s: float) -> float:

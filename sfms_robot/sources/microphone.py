@@ -12,7 +12,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Generator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -84,14 +84,12 @@ class MicrophoneFrame:
         index: of the frame.
         known_s: when it was known, `time.monotonic`.
         audio: (640,) what the person said.
-        voice: a person speaks in it.
         said: (640,) what the robot said meanwhile, where a device records it; as late as `audio`.
     """
 
     index: int
     known_s: float
     audio: Floats
-    voice: bool
     said: Floats | None = None
 
 
@@ -105,10 +103,10 @@ def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker
     device that cannot be opened, and when one goes away.
     """
     with ExitStack() as stack:
-        mic = stack.enter_context(Capture.opened(recording.device, recording.flag))
+        mic = stack.enter_context(closing(Capture.opened(recording.device, recording.flag)))
         said = None
         if recording.reference is not None:
-            said = stack.enter_context(Capture.opened(recording.reference, DEVICE_FLAG))
+            said = stack.enter_context(closing(Capture.opened(recording.reference, DEVICE_FLAG)))
         reference = SpeechFrames() if recording.spoken else None if said is None else LiveVoice()
         front_end = FrontEnd(reference, mic.device.name)
         given = yield mic.device.name
@@ -236,7 +234,7 @@ class FrontEnd:
         self._counts["own_voice_frames"] += own is not None and bool(own.any())
         self._counts["without_reference"] += own is not None and said is None
         own_said = said if isinstance(self._reference, LiveVoice) else None
-        return MicrophoneFrame(index=self._next, known_s=now_s, audio=frame.audio, voice=frame.voice, said=own_said)
+        return MicrophoneFrame(index=self._next, known_s=now_s, audio=frame.audio, said=own_said)
 
 
 # --- the run's side --------------------------------------------------------------------------------------------------
@@ -393,27 +391,25 @@ def open_microphone(argument: str, agent: Voice | None = None) -> Microphone:
     PortError where there is no microphone or it cannot be opened.
     """
     early_s = None if agent is None else getattr(agent, "early_s", 0.0)
-    return _opened(_recording(argument, spoken=agent is not None), early_s)
+    return _opened(argument, MIC_FLAG, early_s=early_s)
 
 
 def open_microphone_and_loudspeaker(argument: str, device: str) -> tuple[Microphone, Loudspeaker]:
     """Open as `open_microphone`, without what `device` records of the robot's voice; return also that voice."""
     reference = device_name(device, DEVICE_FLAG)
-    microphone = _opened(_recording(argument, reference=reference))
+    microphone = _opened(argument, MIC_FLAG, reference)
     return microphone, Loudspeaker(microphone, beside=True)
 
 
 def open_loudspeaker(argument: str) -> Loudspeaker:
     """Open `--agent-audio device:DEVICE` without a microphone. Raises and blocks as `open_microphone`."""
-    return Loudspeaker(_opened(_recording(argument, DEVICE_FLAG)), beside=False)
+    return Loudspeaker(_opened(argument, DEVICE_FLAG), beside=False)
 
 
-def _recording(argument: str, flag: str = MIC_FLAG, **more: Any) -> Recording:
-    return Recording(device=device_name(argument, flag), flag=flag, **more)
-
-
-def _opened(recording: Recording, early_s: float | None = None) -> Microphone:
-    name = "microphone" if recording.flag == MIC_FLAG else "loudspeaker"
+def _opened(argument: str, flag: str, reference: str | None = None, early_s: float | None = None) -> Microphone:
+    """Open `flag`; `early_s`: the robot's own voice comes by calls, so much earlier."""
+    name, device = "microphone" if flag == MIC_FLAG else "loudspeaker", device_name(argument, flag)
+    recording = Recording(device=device, flag=flag, reference=reference, spoken=early_s is not None)
     worker = SourceWorker(name, listen, recording)
     worker.wait()
     microphone = Microphone(worker, early_s)

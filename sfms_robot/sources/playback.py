@@ -16,6 +16,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Generator, Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from statistics import median
 from typing import Any, Final
@@ -54,7 +55,6 @@ class PlaybackOpened:
     """The first message. `latency_s`: from handing a sample over to its leaving, by the device's own word."""
 
     device: str
-    rate_hz: float
     latency_s: float
 
 
@@ -87,9 +87,9 @@ def play(wanted: str) -> Generator[PlaybackMessage | None, Speech | None, None]:
     Raises ConfigError for a device that is not there and without PortAudio, PortError where nothing plays, for a device
     that cannot be opened, and when it goes away.
     """
-    with PlaybackStream.opened(wanted, FLAG) as loudspeaker:
+    with closing(PlaybackStream.opened(wanted, FLAG)) as loudspeaker:
         playout = loudspeaker.playout
-        told = yield PlaybackOpened(loudspeaker.device.name, loudspeaker.rate_hz, loudspeaker.latency_s())
+        told = yield PlaybackOpened(loudspeaker.device.name, loudspeaker.latency_s())
         before: Speech | None = None
         next_statistics_s = 0.0
         while True:

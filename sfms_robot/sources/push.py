@@ -116,8 +116,6 @@ class PushedSight(SourcePart):
 
     def __init__(self, now: Clock = time.monotonic) -> None:
         super().__init__(now)
-        self._lock = threading.Lock()
-        self._origin_s = 0.0
         self._seen: deque[tuple[float, Sighting | None]] = deque(maxlen=SIGHTINGS)  # seconds of `now`
 
     def see(
@@ -146,10 +144,6 @@ class PushedSight(SourcePart):
             at_s = self._now() if seen_s is None else seen_s
             self._seen.append((at_s, None if face is None else Sighting(face, attention)))
 
-    def start(self, origin_s: float) -> None:
-        with self._lock:
-            self._origin_s = origin_s
-
     def at(self, time_s: float) -> Sighting | None:
         """Return as `ports.Sight`; None also from the moment on in which the face was lost."""
         with self._lock:
@@ -176,7 +170,7 @@ class PushedSpeech(SourcePart):
         self._given = 0  # samples of the stretch, at its rate
         self._began = 0  # samples of 16 kHz since 0 of `now`, as all places
         self._place = 0  # of the next sample that comes out of the resampler
-        self._lock = threading.Lock()  # of what is to be played; held for no longer than a list takes
+        # To be played; the lock is held for no longer than a list takes.
         self._pieces: deque[tuple[int, Floats]] = deque()
         self._origin = 0
         self._taken = 0  # up to here it has been asked for

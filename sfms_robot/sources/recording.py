@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, NO_SOUND, FaceFrame, Floats, Sighting
+from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, SILENCE, FaceFrame, Floats, Sighting
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.tracks import Track, resample
 from sfms_robot.sources.live_voice import SourcePart, window
@@ -21,7 +21,7 @@ _EPS_FRAMES = 1e-6
 
 
 class RecordedVoice(SourcePart):
-    """`ports.Voice` of (n,) mono 16 kHz, or of a file that is read during the run. Silence follows its end.
+    """`ports.Voice` of a file that is read during the run. Silence follows its end.
 
     loop: start again instead, after a pause.
 
@@ -29,13 +29,13 @@ class RecordedVoice(SourcePart):
         frames: how many there are; the last is filled up with silence.
     """
 
-    def __init__(self, audio: Floats | AudioFile, loop: bool = False) -> None:
+    def __init__(self, audio: AudioFile, loop: bool = False) -> None:
         super().__init__()
         self._audio = audio
         self._loop = loop
         self._next = 0
         self._ahead: dict[int, Floats] = {}
-        self.frames = math.ceil((audio.length if isinstance(audio, AudioFile) else len(audio)) / FRAME_SAMPLES)
+        self.frames = math.ceil(audio.length / FRAME_SAMPLES)
         self.duration_s: float | None = self.frames * FRAME_S
 
     def take(self, index: int) -> Floats:
@@ -54,23 +54,18 @@ class RecordedVoice(SourcePart):
 
     def close(self) -> None:
         """Close the file. Idempotent."""
-        if isinstance(self._audio, AudioFile):
-            self._audio.close()
+        self._audio.close()
 
     def _frame(self, index: int) -> Floats:
         frame = index % (self.frames + _PAUSE_FRAMES) if self._loop else index
-        part = self._part(frame) if frame < self.frames else NO_SOUND
-        return window(0, part, 0)
-
-    def _part(self, frame: int) -> Floats:
-        if not isinstance(self._audio, AudioFile):
-            return self._audio[frame * FRAME_SAMPLES : (frame + 1) * FRAME_SAMPLES]
+        if frame >= self.frames:
+            return SILENCE
         if frame < self._next:
             self._audio.rewind()
             self._next = 0
         self._audio.read((frame - self._next) * FRAME_SAMPLES)
         self._next = frame + 1
-        return self._audio.read(FRAME_SAMPLES)
+        return window(0, self._audio.read(FRAME_SAMPLES), 0)
 
 
 class RecordedSight(SourcePart):

@@ -7,7 +7,7 @@ imported when they are opened, so that a wrong name is found at once. Any voice 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -51,15 +51,9 @@ KINDS: Final[Mapping[str, Kinds]] = {
 }  # fmt: skip
 
 
-def source_kinds(flag: str, others: Iterable[EntryPoint] | None = None) -> Kinds:
-    """Return every kind of a flag by name, not yet imported; shipped kinds go before those of other packages.
-
-    `others`: those of other packages; None for the installed ones.
-    """
-    if flag == "--agent-audio":
-        return KINDS[flag]
-    found = plugins(GROUP) if others is None else {each.name: each for each in others}
-    return {**found, **KINDS[flag]}
+def source_kinds(flag: str) -> Kinds:
+    """Return every kind of a flag by name, not yet imported; shipped kinds go before those of other packages."""
+    return KINDS[flag] if flag == "--agent-audio" else {**plugins(GROUP), **KINDS[flag]}
 
 
 def split_kind(value: str) -> tuple[str, str]:
@@ -72,18 +66,15 @@ def split_kind(value: str) -> tuple[str, str]:
 class ShippedSpeaker:
     """A recorded person that ships with the package: `sim/speakers/NAME/`."""
 
-    name: str
     audio: Path
     face: Path | None
 
 
 def shipped_speaker(name: str) -> ShippedSpeaker:
-    """Return a shipped speaker by name. Raises ConfigError with the choices."""
-    if name not in speaker_names():
-        raise ConfigError(f"--audio {name!r} is not a shipped speaker ({', '.join(speaker_names())})")
+    """Return a shipped speaker by one of `data.speaker_names`."""
     folder = data_dir("sim") / "speakers" / name
     face = folder / "face.csv.gz"
-    return ShippedSpeaker(name, folder / SPEAKER_VOICE, face if face.is_file() else None)
+    return ShippedSpeaker(folder / SPEAKER_VOICE, face if face.is_file() else None)
 
 
 def voice_file(name: str) -> Path | None:
@@ -98,11 +89,7 @@ def _speaker(name: str) -> ShippedSpeaker | None:
 
 
 def check_source(
-    audio: str = "default",
-    face: str = "auto",
-    agent_audio: str = "none",
-    play: str | None = None,
-    others: Iterable[EntryPoint] | None = None,
+    audio: str = "default", face: str = "auto", agent_audio: str = "none", play: str | None = None
 ) -> None:
     """Check that there are such kinds, or such files, and something to play. Imports and opens nothing.
 
@@ -114,7 +101,7 @@ def check_source(
         ("--face", face, _existing(face), ["FILE.csv", "FILE.csv.gz", "none", "auto"]),
         ("--agent-audio", agent_audio, voice_file(agent_audio), ["FILE.wav", "none", *speakers]),
     ):
-        kinds = source_kinds(flag, others)
+        kinds = source_kinds(flag)
         if split_kind(value)[0] not in kinds and value not in files and file is None:
             problem = "sound is not read from a pipe: write it to a file" if value == "-" else "no such file"
             raise ConfigError(f"{flag} {value}: {problem} ({', '.join([*kinds, *files])})")
@@ -133,7 +120,6 @@ def open_source(
     play: str | None = None,
     visitor: PageVisitor | None = None,
     router: Router = LOCAL,
-    others: Iterable[EntryPoint] | None = None,
 ) -> Source:
     """Open a person by the flags of a run.
 
@@ -146,18 +132,17 @@ def open_source(
         play: the device that plays it; None: it is played elsewhere.
         visitor: the person in front of the page, where one is served.
         router: of ROS 2.
-        others: see `source_kinds`.
 
     Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
     """
     from sfms_robot.sources.paired import JudgedSource, PairedSource
 
-    check_source(audio, face, agent_audio, play if agent is None else None, others)
+    check_source(audio, face, agent_audio, play if agent is None else None)
     if audio == "default":
         audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
     again = loop and duration_s is not None
     with ExitStack() as failed:  # closes what was opened before the one that cannot be
-        opened = partial(_opened, failed, others)
+        opened = partial(_opened, failed)
         voice: Any
         own: Any = agent
         if own is None and split_kind(audio)[0] == "mic" and split_kind(agent_audio)[0] == "device":
@@ -186,10 +171,10 @@ def open_source(
     return source
 
 
-def _opened(failed: ExitStack, others: Iterable[EntryPoint] | None, flag: str, value: str, **more: Any) -> Any:
+def _opened(failed: ExitStack, flag: str, value: str, **more: Any) -> Any:
     """Open a kind; None where `value` names none. `more`: by kind, what its callable takes besides its argument."""
     name, argument = split_kind(value)
-    kind = source_kinds(flag, others).get(name)
+    kind = source_kinds(flag).get(name)
     if kind is None:
         return None
     part = plug_in(kind, argument, more[name]) if name in more else plug_in(kind, argument)

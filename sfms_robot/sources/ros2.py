@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from sfms_robot.network import LOCAL, Ros2Node, Router, ros_domain, ros_topic
 from sfms_robot.signals.ros2_messages import ACTION_UNITS, AUDIO, Message, face_of, read_message, wire_name
 from sfms_robot.signals.spaces import beyond
 from sfms_robot.sources.live_face import LOST_S, UNHEARD_S, LiveFace, parse_face_argument
-from sfms_robot.sources.live_voice import check_rate
+from sfms_robot.sources.live_voice import SourcePart, check_rate
 from sfms_robot.sources.push import PushedVoice
 
 logger = logging.getLogger(__name__)
@@ -43,42 +43,49 @@ def _options(flag: str, argument: str, **given: str) -> tuple[str, dict[str, str
     return place, given
 
 
-class _Subscription:
-    """One topic: its messages, whether they have stopped, and a line where none came.
+class _Subscriber(SourcePart):
+    """A part that takes the messages of one topic: whether they have stopped, and a line where none came."""
 
-    take: is handed each message.
-    """
+    _flag: ClassVar[str]
+    _counted = 0
+    _heard_s: float | None = None
+    _said = False
 
-    def __init__(
-        self, flag: str, topic: str, domain: str, router: Router, *, kind: str, take: Callable[[Message], None]
+    def _subscribe(
+        self, topic: str, domain: str, router: Router, *, kind: str, take: Callable[[Message], None]
     ) -> None:
-        self._flag, self._topic = flag, topic
-        self.node = Ros2Node(
-            f"sfms_robot_{flag.split()[0].strip('-')}",
-            ros_domain(domain, flag),
+        """Hand each message of `topic` to `take`. Raises ConfigError."""
+        self._topic = ros_topic(topic, self._flag)
+        self._node = Ros2Node(
+            f"sfms_robot_{self._flag.split()[0].strip('-')}",
+            ros_domain(domain, self._flag),
             router,
-            takes={topic: wire_name(kind)},
+            takes={self._topic: wire_name(kind)},
             received=lambda _, wire, data: take(read_message(kind, wire, data)),
         )
-        self._counted = 0
-        self._heard_s: float | None = None
-        self._said = False
 
-    def lost(self, time_s: float, after_s: float) -> bool:
-        """Return whether messages came before loop time `time_s`, and have stopped for `after_s`."""
-        counted = self.node.counts["received"] - self.node.counts["refused"]
+    def statistics(self) -> Mapping[str, Any]:
+        """Return the node's counts of messages, and those of what they become."""
+        return {**super().statistics(), **self._node.counts}
+
+    def close(self) -> None:
+        self._node.close()
+
+    def _look(self, time_s: float, after_s: float) -> None:
+        """Note whether messages came before loop time `time_s`, and have stopped for `after_s`."""
+        counted = self._node.counts["received"] - self._node.counts["refused"]
         if counted > self._counted:
             self._counted, self._heard_s = counted, time_s
         if self._heard_s is None and time_s > UNHEARD_S and not self._said:
             self._said = True
-            logger.warning("%s: nothing came yet: %s", self._flag, self.node.absence(self._topic))
-        return self._heard_s is not None and time_s - self._heard_s > after_s
+            logger.warning("%s: nothing came yet: %s", self._flag, self._node.absence(self._topic))
+        self.lost = self._heard_s is not None and time_s - self._heard_s > after_s
 
 
-class Ros2Voice(PushedVoice):
+class Ros2Voice(_Subscriber, PushedVoice):
     """`ports.Voice` of `--audio ros2:TOPIC[,rate=HZ][,channels=N][,domain=N]`. Raises ConfigError."""
 
-    _way = "--audio ros2"
+    _flag = _way = "--audio ros2"
 
     def __init__(self, argument: str, router: Router = LOCAL) -> None:
         super().__init__()
@@ -90,18 +97,11 @@ class Ros2Voice(PushedVoice):
             raise ConfigError(f"{self._way}:{argument}: {error}") from None
         if not 0 < self._channels <= MOST_CHANNELS:
             raise ConfigError(f"{self._way}: channels: expected 1 to {MOST_CHANNELS}, got {self._channels}")
-        topic = ros_topic(place, self._way)
-        self._topic = _Subscription(self._way, topic, given["domain"], router, kind=AUDIO, take=self._hear)
+        self._subscribe(place, given["domain"], router, kind=AUDIO, take=self._hear)
 
     def take(self, index: int) -> Floats | None:
-        self.lost = self._topic.lost((index + 1) * FRAME_S, SILENT_S)
+        self._look((index + 1) * FRAME_S, SILENT_S)
         return super().take(index)
-
-    def statistics(self) -> Mapping[str, Any]:
-        return {**super().statistics(), **self._topic.node.counts}
-
-    def close(self) -> None:
-        self._topic.node.close()
 
     def _hear(self, message: Message) -> None:
         sound = message["audio"]["data"].tobytes()
@@ -112,26 +112,20 @@ class Ros2Voice(PushedVoice):
         self.hear(samples if self._channels > 1 else samples[:, 0], self._sent_hz)
 
 
-class Ros2Sight(LiveFace):
+class Ros2Sight(_Subscriber, LiveFace):
     """`ports.Sight` of `--face ros2:FACE_ID|TOPIC[,domain=N][,flip=...]`. Raises ConfigError."""
 
+    _flag = "--face ros2"
+
     def __init__(self, argument: str, router: Router = LOCAL) -> None:
-        flag = "--face ros2"
-        place, given = _options(flag, argument, flip="")
+        place, given = _options(self._flag, argument, flip="")
         super().__init__(parse_face_argument("ros2", f",flip={given['flip']}" if given["flip"] else "")[1])
-        topic = ros_topic(place if "/" in place else f"/humans/faces/{place}/facs", flag)
-        self._topic = _Subscription(flag, topic, given["domain"], router, kind=ACTION_UNITS, take=self._see)
+        topic = place if "/" in place else f"/humans/faces/{place}/facs"
+        self._subscribe(topic, given["domain"], router, kind=ACTION_UNITS, take=self._see)
 
     def at(self, time_s: float) -> Sighting | None:
-        self.lost = self._topic.lost(time_s, LOST_S)
+        self._look(time_s, LOST_S)
         return super().at(time_s)
-
-    def statistics(self) -> Mapping[str, Any]:
-        """Return the node's counts of messages."""
-        return dict(self._topic.node.counts)
-
-    def close(self) -> None:
-        self._topic.node.close()
 
     def _see(self, message: Message) -> None:
         motion = face_of(message)

@@ -22,7 +22,7 @@ import numpy as np
 from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
-from sfms_robot.signals.audio import environment
+from sfms_robot.processes import environment
 from sfms_robot.sources.live_voice import LiveVoice, Pace
 from sfms_robot.sources.worker import SourceWorker
 
@@ -75,7 +75,7 @@ class SoundDevice:
 
 
 class DeviceStream:
-    """A stream of PortAudio's on one device. Base of what records and of what plays; closed by its `with` block.
+    """A stream of PortAudio's on one device. Base of what records and of what plays.
 
     Attributes:
         plays: it plays; else it records.
@@ -129,12 +129,6 @@ class DeviceStream:
             self._stream.abort()
             self._stream.close()
             self._stream = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def _start(self, stream: Any) -> bool:
         """Open one of sounddevice's streams; return whether sound flows. Raises PortAudio's errors."""

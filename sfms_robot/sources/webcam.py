@@ -194,7 +194,7 @@ def live(capture: Any, name: str) -> Iterator[tuple[float, Picture]]:
         stamped_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
         found, picture = capture.retrieve()
         if found:
-            yield stamped_s if 0 <= came_s - stamped_s < _OLDEST_S else came_s, _rgb(picture)
+            yield stamped_s if 0 <= came_s - stamped_s < _OLDEST_S else came_s, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
 def played(capture: Any, begins_s: float) -> Iterator[tuple[float, Picture | None]]:
@@ -212,14 +212,7 @@ def played(capture: Any, begins_s: float) -> Iterator[tuple[float, Picture | Non
             time.sleep(min(wait_s, _ALIVE_S))
         found, picture = capture.retrieve()
         if found:
-            yield due_s, _rgb(picture)
-
-
-def _rgb(picture: Any) -> Picture:
-    import cv2
-
-    out: Picture = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-    return out
+            yield due_s, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
 def _duration_s(capture: Any) -> float | None:
@@ -346,7 +339,7 @@ class Webcam(LiveFace):
         return {
             **self._worker.statistics(),
             **self._counts,
-            "latency_ms": self._latency_ms.report(p50=50, p99=99),
+            "latency_ms": self._latency_ms.report(50, 99),
         }
 
     def close(self) -> None:
@@ -377,5 +370,4 @@ def open_webcam(argument: str) -> Webcam:
     source = str(Path(place).absolute()) if place and not place.isdigit() else place or "0"
     worker = SourceWorker(f"webcam {place or 0}", watch, source, nice=_NICE)
     worker.wait()
-    opened = worker.messages(time.monotonic())[0]
-    return Webcam(worker, signs, opened.duration_s if isinstance(opened, WebcamOpened) else None)
+    return Webcam(worker, signs, worker.messages(time.monotonic())[0].duration_s)

@@ -65,11 +65,6 @@ def test_rows_forget_2_s_ago_come_at_the_rate_of_the_data_and_do_not_depend_on_l
     np.testing.assert_allclose(model.of_recording(NOISE)[-1], model.of_recording(0.2 * NOISE)[-1], atol=1e-2)
 
 
-def test_window_ends_with_the_frame():
-    assert (wav2vec2.WINDOW - wav2vec2.FIELD) % wav2vec2.STRIDE == 0
-    assert wav2vec2._reach([10, 3, 3, 3, 3, 2, 2], [5, 2, 2, 2, 2, 2, 2]) == (wav2vec2.FIELD, wav2vec2.STRIDE)
-
-
 @pytest.mark.parametrize(
     ("config", "message"),
     [

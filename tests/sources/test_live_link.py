@@ -16,7 +16,6 @@ from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbere
 from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import NOTE, PacketError
 from sfms_robot.frames import CHANNEL_INDEX, ORDERS, SHAPES
-from sfms_robot.sources.live_face import Datagram
 from sfms_robot.sources.live_link import LiveLinkDecoder, motion_of, open_live_link, parse_packet
 
 PACKETS = recorded_packets()
@@ -206,7 +205,7 @@ def test_an_emulated_phone_is_seen(sight):
     while sight.statistics()["packets"] < 11:  # a slow call leaves some to the next
         sight.at(1e9)
     assert sight.statistics()["faces"] == 0  # its units are not decided yet
-    sight.feed(Datagram(renumbered(PACKETS[10], 2**20), sight._sender, sight._heard_s + 1.0))
+    sight.feed(renumbered(PACKETS[10], 2**20), sight._sender, sight._heard_s + 1.0)
     face = sight.at(1e9).face
     assert face.time_s > 0 and face.blendshapes.max() <= motion_of(parse_packet(PACKETS[10]).values)[SHAPES].max()
     assert sight.statistics()["faces"] == 1 and sight.statistics()["lost"] == 0
@@ -217,7 +216,7 @@ def test_head_angles_are_radians_or_degrees_as_the_first_second_says(sight, fact
     shown = []
     for number in range(120):
         yaw = 0.1 * np.sin(number / 5) * factor
-        sight.feed(Datagram(packet(number, (*FACE, yaw, 0.0, 0.0)), ("192.0.2.1", 1), number / 30))
+        sight.feed(packet(number, (*FACE, yaw, 0.0, 0.0)), ("192.0.2.1", 1), number / 30)
         seen = sight.at(number / 30)
         shown += [seen.face.pose[2]] if seen else []
     assert len(shown) == 90 and 0.05 < max(map(abs, shown)) < 0.25
@@ -228,10 +227,10 @@ def test_pose_channels_are_flipped_on_request():
     values, poses = np.zeros(61, np.float32), {}
     for flip in ("", ",flip=yaw+roll"):
         opened = open_live_link(f"127.0.0.1:{free_udp_port()}{flip}")
-        opened.feed(Datagram(packet(1, values), ("192.0.2.1", 1), 0.0))
-        opened.feed(Datagram(packet(61, values), ("192.0.2.1", 1), 1.0))  # straight ahead
+        opened.feed(packet(1, values), ("192.0.2.1", 1), 0.0)
+        opened.feed(packet(61, values), ("192.0.2.1", 1), 1.0)  # straight ahead
         assert opened.at(1.0).face.pose[:3] == pytest.approx([0, 0, 0])
-        opened.feed(Datagram(packet(62, (*values[:52], 0.3, 0.2, 0.1, *values[55:])), ("192.0.2.1", 1), 1.02))
+        opened.feed(packet(62, (*values[:52], 0.3, 0.2, 0.1, *values[55:])), ("192.0.2.1", 1), 1.02)
         poses[flip] = opened.at(1.02).face.pose[:3]
         opened.close()
     assert poses[""] == pytest.approx([0.1, 0.2, 0.3], abs=0.02)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from recorded_sound import recorded_voice
 
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
@@ -16,7 +17,6 @@ from sfms_robot.sources.microphone import Microphone
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.playback import EARLY_S, HUSH_S, MARGIN_S, PlaybackOpened, PlayedVoice, Playout
 from sfms_robot.sources.push import PushedSpeech
-from sfms_robot.sources.recording import RecordedVoice
 
 TICK_S = 0.01
 LATENCY_S = 0.06
@@ -170,7 +170,7 @@ class VirtualLoudspeaker:
     def __init__(self):
         self.now_s, self.lost = ORIGIN_S, False
         self.device = VirtualDevice(AUDIO_HZ, begins_s=0.0)
-        self._messages = [PlaybackOpened("virtual", AUDIO_HZ, LATENCY_S)]
+        self._messages = [PlaybackOpened("virtual", LATENCY_S)]
         self._told = None
         self.left = np.zeros(20 * AUDIO_HZ, np.float32)
 
@@ -250,7 +250,7 @@ def talk():
 @pytest.mark.parametrize("late_s", [0.0, 0.1])
 def test_of_a_recording_what_is_taken_a_frame_early_is_what_leaves(late_s):
     said = noise(2.0)
-    desk = Desk(RecordedVoice(said), late_s).until(3.0)
+    desk = Desk(recorded_voice(said), late_s).until(3.0)
     np.testing.assert_allclose(desk.taken[FRAME_SAMPLES:], desk.left[FRAME_SAMPLES:], atol=1e-5)
     begins = round(desk.voice.delay_s * AUDIO_HZ)
     np.testing.assert_allclose(desk.left[begins : begins + len(said)], said, atol=1e-5)
@@ -306,7 +306,7 @@ def test_a_hush_is_heard_as_soon_as_the_device_can_and_the_next_sentence_after_i
 
 def test_a_device_that_runs_dry_is_a_silence_that_is_told_and_counted(caplog):
     said = noise(3.0)
-    desk = Desk(RecordedVoice(said)).until(1.0)
+    desk = Desk(recorded_voice(said)).until(1.0)
     desk.loudspeaker.device.starve(0.2)
     desk.until(2.5)
     assert desk.voice.statistics()["unsaid_ms"] == pytest.approx(200.0, abs=1.0)
@@ -320,7 +320,7 @@ def test_a_device_that_runs_dry_is_a_silence_that_is_told_and_counted(caplog):
 
 
 def test_where_nobody_hears_it_the_robot_says_nothing():
-    desk = Desk(RecordedVoice(noise(3.0))).until(1.0)
+    desk = Desk(recorded_voice(noise(3.0))).until(1.0)
     desk.loudspeaker.lost = True
     assert desk.voice.lost and not desk.voice.take(26).any()
     desk.loudspeaker.lost = False
@@ -368,7 +368,7 @@ class Sent(list):
 
 def test_the_echo_canceller_is_told_every_frame_and_a_little_early():
     """It asks, the frame before the newest too, before the microphone's frame is there."""
-    desk, sent = Desk(RecordedVoice(noise(2.0))), Sent()
+    desk, sent = Desk(recorded_voice(noise(2.0))), Sent()
     source = PairedSource(Microphone(sent, EARLY_S), None, desk.voice)
     source.start(desk.loudspeaker.now_s)
     for index in range(1, 26):

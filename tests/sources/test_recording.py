@@ -6,6 +6,7 @@ import pytest
 import soundfile
 from hypothesis import given
 from hypothesis import strategies as st
+from recorded_sound import recorded_voice
 
 from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError
@@ -13,16 +14,16 @@ from sfms_robot.frames import CHANNELS, FRAME_SAMPLES
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.tracks import Track, write_track
 from sfms_robot.sources.paired import PairedSource
-from sfms_robot.sources.recording import RecordedSight, RecordedVoice
+from sfms_robot.sources.recording import RecordedSight
 from sfms_robot.sources.registry import open_source, shipped_speaker
 
 
 def recorded(audio, track, duration_s=None, loop=True, agent_audio=None):
     """As `open_source` joins them."""
     loop = loop and duration_s is not None
-    voice = None if audio is None else RecordedVoice(audio, loop)
+    voice = None if audio is None else recorded_voice(audio, loop)
     sight = None if track is None else RecordedSight(track, loop, voice and voice.frames)
-    return PairedSource(voice, sight, None if agent_audio is None else RecordedVoice(agent_audio), duration_s)
+    return PairedSource(voice, sight, None if agent_audio is None else recorded_voice(agent_audio), duration_s)
 
 
 def voice(frames):

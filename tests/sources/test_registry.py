@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,24 +11,13 @@ import pytest
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import SpeakerFrame
 from sfms_robot.ports import Source
+from sfms_robot.signals.audio import AudioFile
 from sfms_robot.sources.paired import LONGEST_WAIT_S
 from sfms_robot.sources.push import PushedSight, PushedVoice
 from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import KINDS, check_source, open_source, shipped_speaker, source_kinds
 
 FACE = str(shipped_speaker("facegood_1114_3_16").face)
-
-
-class Entry:
-    """The part of importlib's EntryPoint that is used."""
-
-    def __init__(self, name, value, loaded=None):
-        self.name, self.value, self.loaded, self.dist = name, value, loaded, None
-
-    def load(self):
-        if self.loaded is None:
-            raise ImportError("no module named so")
-        return self.loaded
 
 
 class Own(Source):
@@ -40,13 +30,26 @@ class Own(Source):
         self.closed = True
 
 
-def kinds(**loaded):
-    return [Entry(name, f"theirs:{name}", value) for name, value in loaded.items()]
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Install kinds of another package by name; None: one whose module is not there."""
+
+    def installed(**loaded):
+        info = tmp_path / "theirs-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1.0\n")
+        lines = [f"{name} = {'theirs' if value else 'nowhere'}:{name}" for name, value in loaded.items()]
+        (info / "entry_points.txt").write_text("\n".join(["[sfms_robot.sources]", *lines]))
+        monkeypatch.setitem(sys.modules, "theirs", SimpleNamespace(**loaded))
+        monkeypatch.syspath_prepend(tmp_path)
+
+    return installed
 
 
-def test_a_kind_gets_what_stands_behind_the_colon_and_is_closed():
+def test_a_kind_gets_what_stands_behind_the_colon_and_is_closed(install):
     inner, told = Own(), []
-    source = open_source("ear:left:2", others=kinds(ear=lambda argument: told.append(argument) or inner))
+    install(ear=lambda argument: told.append(argument) or inner)
+    source = open_source("ear:left:2")
     source.close()
     assert told == ["left:2"] and inner.closed
 
@@ -54,9 +57,9 @@ def test_a_kind_gets_what_stands_behind_the_colon_and_is_closed():
 @pytest.mark.parametrize("audio", ["push:0", "katie", "none", "ear"])
 @pytest.mark.parametrize("face", ["push:0", "none", FACE, "eye"])
 @pytest.mark.parametrize("agent_audio", ["katie", "none"])
-def test_any_voice_goes_with_any_face(audio, face, agent_audio):
-    theirs = kinds(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
-    source = open_source(audio, face, 2.0, agent_audio=agent_audio, others=theirs)
+def test_any_voice_goes_with_any_face(install, audio, face, agent_audio):
+    install(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
+    source = open_source(audio, face, 2.0, agent_audio=agent_audio)
     source.start(0.0)
     frames = source.read(2.0 + LONGEST_WAIT_S)
     assert [frame.time_s for frame in frames] == [index / 25 for index in range(1, 51)]
@@ -81,46 +84,49 @@ def test_a_run_lasts_as_long_as_its_recording(audio, face, agent_audio, duration
         assert source.duration_s == (duration_s and pytest.approx(duration_s))
 
 
-def test_what_is_no_voice_or_no_face_or_brings_its_own_is_refused():
+def test_what_is_no_voice_or_no_face_or_brings_its_own_is_refused(install):
     inner = Own()
-    with pytest.raises(ConfigError, match="--face push: --audio ear brings its own"):
-        open_source("ear", "push", others=kinds(ear=lambda argument: inner))
+    install(person=lambda argument: inner, ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
+    with pytest.raises(ConfigError, match="--face push: --audio person brings its own"):
+        open_source("person", "push")
     assert inner.closed
-    theirs = kinds(ear=lambda argument: PushedVoice(), eye=lambda argument: PushedSight())
     with pytest.raises(ConfigError, match="--audio eye: theirs:eye gave a PushedSight, no voice or source"):
-        open_source("eye", others=theirs)
+        open_source("eye")
     with pytest.raises(ConfigError, match="--face ear: theirs:ear gave a PushedVoice, no face"):
-        open_source("none", "ear", others=theirs)
+        open_source("none", "ear")
 
 
-def test_what_was_opened_is_closed_when_the_next_cannot_be():
+def test_what_was_opened_is_closed_when_the_next_cannot_be(install):
     class Ear(RecordedVoice):
         closed = False
 
         def close(self):
+            super().close()
             self.closed = True
 
-    ear = Ear(np.zeros(640, dtype=np.float32))
-    with pytest.raises(ConfigError, match="plug-in broken .*theirs:broken.: ImportError"):
-        open_source("ear", "broken", others=kinds(ear=lambda argument: ear, broken=None))
+    ear = Ear(AudioFile(shipped_speaker("katie").audio))
+    install(ear=lambda argument: ear, broken=None)
+    with pytest.raises(ConfigError, match="plug-in broken .*nowhere:broken.: ModuleNotFoundError"):
+        open_source("ear", "broken")
     assert ear.closed
 
 
-def test_kinds_of_other_packages_are_imported_when_opened_and_never_replace_ours():
-    theirs = kinds(push=Own, broken=None)
-    assert all(source_kinds(flag, theirs)["push"] is KINDS[flag]["push"] for flag in ("--audio", "--face"))
-    check_source("broken", others=theirs)
-    with pytest.raises(ConfigError, match="plug-in broken .*theirs:broken.: ImportError: no module named so"):
-        open_source("broken", others=theirs)
+def test_kinds_of_other_packages_are_imported_when_opened_and_never_replace_ours(install):
+    install(push=Own, broken=None)
+    assert all(source_kinds(flag)["push"] is KINDS[flag]["push"] for flag in ("--audio", "--face"))
+    check_source("broken")
+    with pytest.raises(ConfigError, match="plug-in broken .package theirs, nowhere:broken.: ModuleNotFoundError: No"):
+        open_source("broken")
 
 
 @pytest.mark.parametrize("fault", [KeyError("ear"), OSError(19, "No such device"), SystemExit(1)])
-def test_a_kind_that_raises_when_it_is_made_is_one_line(fault):
+def test_a_kind_that_raises_when_it_is_made_is_one_line(install, fault):
     def made(argument):
         raise fault
 
+    install(ear=made)
     with pytest.raises(ConfigError, match=f"^plug-in ear .*theirs:ear.: {type(fault).__name__}: .+$"):
-        open_source("ear", others=kinds(ear=made))
+        open_source("ear")
 
 
 def test_a_name_that_is_wrong_is_found_before_anything_is_loaded():

@@ -7,6 +7,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 import soundfile
+from recorded_sound import recorded_voice
 from scripted_worker import wait_for_message
 
 from sfms_robot.data import data_dir
@@ -17,7 +18,6 @@ from sfms_robot.sources.live_voice import LiveVoice
 from sfms_robot.sources.microphone import open_microphone
 from sfms_robot.sources.playback import open_playback
 from sfms_robot.sources.push import PushedSpeech
-from sfms_robot.sources.recording import RecordedVoice
 from sfms_robot.sources.registry import open_source
 from sfms_robot.sources.sound_devices import Capture, sound_devices
 
@@ -224,8 +224,8 @@ def test_what_is_told_to_leave_is_what_is_recorded_then(sound_server):
     said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 7 * AUDIO_HZ]
     taken, frames, monitor = [], [], LiveVoice()
     with (
-        closing(open_playback("person", RecordedVoice(said))) as played,
-        Capture.opened("person.monitor", "--audio mic") as capture,
+        closing(open_playback("person", recorded_voice(said))) as played,
+        closing(Capture.opened("person.monitor", "--audio mic")) as capture,
     ):
         origin_s = time.monotonic()
         monitor.start(origin_s)
@@ -251,7 +251,7 @@ def test_what_is_told_to_leave_is_what_is_recorded_then(sound_server):
 def test_a_loudspeaker_that_was_unplugged_is_found_again(sound_server, caplog):
     caplog.set_level(logging.INFO, "sfms_robot")
     said = noise(60.0)
-    with closing(open_source("none", "none", agent=RecordedVoice(said), play="person")) as source:
+    with closing(open_source("none", "none", agent=recorded_voice(said), play="person")) as source:
         origin_s = time.monotonic()
         source.start(origin_s)
         frames = []
@@ -277,7 +277,7 @@ def test_a_loudspeaker_that_was_unplugged_is_found_again(sound_server, caplog):
 def test_a_loudspeaker_that_is_not_there_is_one_line_with_the_choices(sound_server):
     for wanted in ("nobody", "7"):
         with pytest.raises(ConfigError, match=f"^--play {wanted}: no such device .*person") as raised:
-            open_playback(wanted, RecordedVoice(noise(0.1)))
+            open_playback(wanted, recorded_voice(noise(0.1)))
         assert "\n" not in str(raised.value)
 
 

@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, SHAPES
-from sfms_robot.sources.live_face import Datagram
 from sfms_robot.sources.vmc import VmcDecoder, elements, open_vmc, turn_of_unity
 
 LEVEL = (0.0, 0.0, 0.0)
@@ -255,7 +254,7 @@ def test_avatar_software_on_this_machine_is_seen(sight):
     while not sight.statistics()["packets"]:
         sight.at(1e9)
     for later_s, jaw in ((1.0, 0.0), (0.1, 0.5)):
-        sight.feed(Datagram(bundle(blend("jawOpen", jaw), APPLY), sight._sender, sight._heard_s + later_s))
+        sight.feed(bundle(blend("jawOpen", jaw), APPLY), sight._sender, sight._heard_s + later_s)
         seen = sight.at(1e9)
     assert seen.face.blendshapes[BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5, abs=0.01)
 
@@ -264,7 +263,7 @@ def test_avatar_software_on_this_machine_is_seen(sight):
 def test_percent_and_a_new_port_for_each_packet_are_taken_and_the_units_said_once(sight, apply, caplog):
     for number in range(90):
         data = bundle(blend("jawOpen", 50.0 + 50.0 * math.sin(number / 5)), *apply)
-        sight.feed(Datagram(data, ("192.0.2.1", 1000 + number), number / 30))
+        sight.feed(data, ("192.0.2.1", 1000 + number), number / 30)
         sight.at(number / 30)
         assert not sight.lost
     assert 58 <= sight.statistics()["faces"] <= 60 and sight.statistics()["refused"] == 0
@@ -277,6 +276,6 @@ def test_packets_without_a_face_are_a_loss_with_its_reason_unless_the_sender_has
     sight, caplog, values, lost
 ):
     for number in range(90):
-        sight.feed(Datagram(bundle(message("/VMC/Ext/OK", *values)), ("192.0.2.1", 1), number / 30))
+        sight.feed(bundle(message("/VMC/Ext/OK", *values)), ("192.0.2.1", 1), number / 30)
         sight.at(number / 30)
     assert sight.lost == lost and sum("neither blendshapes" in record.message for record in caplog.records) == lost
