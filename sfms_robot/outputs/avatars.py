@@ -27,14 +27,13 @@ import numpy as np
 
 from sfms_robot.endpoint import address_text
 from sfms_robot.errors import OutputError
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS, POSE, SHAPES, Doubles, Floats
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, ORDERS, POSE, SHAPES
 from sfms_robot.outputs.registry import parse_address
 from sfms_robot.ports import Facts, Output, OutputFrame
-from sfms_robot.signals.gaze_kinematics import EYE_PAN_RAD, EYE_TILT_RAD, directions
+from sfms_robot.signals.gaze_kinematics import EYES_RAD, directions
 
 SUBJECT: Final = "sfms-robot"  # as Unreal lists it
 LARGEST_PACKET: Final = 1400  # bytes, so that no network cuts it in two
-_EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])
 _RATE: Final = 50  # of Live Link
 _DAY: Final = 86_400 * _RATE  # frames
 
@@ -85,11 +84,6 @@ class UdpOutput(Output):
         """Close the socket. Idempotent."""
         if self._socket is not None:
             self._socket.close()
-
-
-def eye_directions(motion: Floats) -> Doubles:
-    """Return yaw and pitch [rad] (2, 2) of the left and the right eye of motion (58,)."""
-    return directions(motion, _EYES_RAD)
 
 
 # --- VMC ------------------------------------------------------------------------------------------------------------
@@ -145,7 +139,7 @@ class VmcOutput(UdpOutput):
     def packets(self, frame: OutputFrame, now_s: float) -> Sequence[bytearray]:
         roll, pitch, yaw = frame.motion[POSE][:3].tolist()
         half = unity_quaternion(roll, pitch, yaw, 0.5)
-        eyes = (unity_quaternion(0.0, tilt, turn) for turn, tilt in eye_directions(frame.motion).tolist())
+        eyes = (unity_quaternion(0.0, tilt, turn) for turn, tilt in directions(frame.motion, EYES_RAD).tolist())
         values = [(frame.time_s,), half, half, *eyes, *((each,) for each in frame.motion[SHAPES].tolist())]
         for (packet, at), numbers in zip(self._places, values, strict=True):
             struct.pack_into(f">{len(numbers)}f", packet, at, *numbers)
@@ -194,6 +188,6 @@ class LiveLinkOutput(UdpOutput):
         due = round((now_s - self._midnight_s) * _RATE)
         # One after the other: by the clock alone, a frame that is a little late would skip a number.
         self._number = self._number + 1 if abs(self._number + 1 - due) < _RATE / 2 else due
-        eyes = [each for turn, tilt in eye_directions(frame.motion).tolist() for each in (turn, tilt, 0.0)]
+        eyes = [each for turn, tilt in directions(frame.motion, EYES_RAD).tolist() for each in (turn, tilt, 0.0)]
         values = np.array([*frame.motion[_ORDER], *eyes], ">f4").tobytes()
         return [self._head + struct.pack(">ifiiB", self._number % _DAY, 0.0, _RATE, 1, len(values) // 4) + values]

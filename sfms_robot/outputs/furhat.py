@@ -24,9 +24,9 @@ import numpy as np
 
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, SHAPES, Floats
-from sfms_robot.outputs.avatars import eye_directions
-from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput, WebSocketPeer
+from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput
 from sfms_robot.ports import ChannelLimit, OutputFrame
+from sfms_robot.signals.gaze_kinematics import EYES_RAD, directions
 
 KEY: Final = "FURHAT_KEY"
 
@@ -45,7 +45,7 @@ def params_of(motion: Floats) -> dict[str, float]:
     """Return the parameters of a face for motion (58,)."""
     shapes = motion[SHAPES].astype(np.float64)
     shapes[_LOOKS] = 0.0
-    pan, tilt = np.degrees(eye_directions(motion).mean(axis=0)).round(2).tolist()
+    pan, tilt = np.degrees(directions(motion, EYES_RAD).mean(axis=0)).round(2).tolist()
     turns = {name: round(math.degrees(float(motion[CHANNEL_INDEX[channel]])), 3) for name, channel in _NECK.items()}
     return {**dict(zip(_NAMES, shapes.round(4).tolist(), strict=True)), **turns, "GAZE_PAN": pan, "GAZE_TILT": tilt}
 
@@ -63,20 +63,20 @@ class Furhat(WebSocketOutput):
     answers = False
     limits: Mapping[str, ChannelLimit] = {"yaw": _neck(45), "pitch": _neck(25), "roll": _neck(20)}
 
-    def greet(self, link: WebSocketPeer) -> None:
+    def greet(self) -> None:
         now_s = time.monotonic()
         key = {"key": os.environ[KEY]} if KEY in os.environ else {}
-        link.send({"type": "request.auth", **key}, now_s, may_drop=False)
-        answers = (each for each in link.until(now_s + CONNECT_S) if each.get("type") == "response.auth")
+        self.say({"type": "request.auth", **key})
+        answers = (each for each in self.link.until(now_s + CONNECT_S) if each.get("type") == "response.auth")
         if (answer := next(answers, None)) is None:
             raise OutputError("does not answer request.auth: is it a Furhat's Realtime API?")
         if answer.get("access") is not True:
             raise OutputError(f"refuses access: set {KEY} to the key in the robot's web interface")
-        self._configure(link, own=False)
+        self._configure(own=False)
         neutral = {"yaw": 0.0, "pitch": 0.0, "roll": 0.0, "relative": False, "speed": "slow"}
-        link.send({"type": "request.face.headpose", **neutral}, now_s, may_drop=False)
+        self.say({"type": "request.face.headpose", **neutral})
         began_s = time.monotonic()
-        self.heard([each for each in link.until(began_s + self.neutral_s)], began_s)
+        self.heard([each for each in self.link.until(began_s + self.neutral_s)], began_s)
 
     def message(self, frame: OutputFrame, now_s: float) -> Message:
         return {"type": "request.face.params", "params": params_of(frame.motion)}
@@ -86,10 +86,10 @@ class Furhat(WebSocketOutput):
             if str(message.get("type")).endswith("error"):
                 raise OutputError(f"answers {message.get('type')}: {message.get('message') or message}")
 
-    def farewell(self, link: WebSocketPeer) -> None:
+    def farewell(self) -> None:
         """Give blinking and sway back to the robot."""
-        self._configure(link, own=True)
+        self._configure(own=True)
 
-    def _configure(self, link: WebSocketPeer, own: bool) -> None:
+    def _configure(self, own: bool) -> None:
         config = {"type": "request.face.config", **dict.fromkeys(_OWN, own)}
-        link.send(config, time.monotonic(), may_drop=False)
+        self.say(config)

@@ -32,7 +32,7 @@ import orjson
 from sfms_robot.config.head import other_side
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import CHANNELS, POSE, Doubles, Floats
-from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput, WebSocketPeer
+from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput
 from sfms_robot.ports import ChannelLimit, Facts, OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.rotations import rotation
@@ -202,16 +202,16 @@ class ReachyMini(ReachyDaemon):
         self._goal = np.eye(4)  # sent last
         self._together_s: float | None = None  # when the head was last seen near it
 
-    def greet(self, link: WebSocketPeer) -> None:
+    def greet(self) -> None:
         self.check()
         lock = self._get("/api/daemon/robot-app-lock-status")
         if lock.get("state") != "free" and not str(lock.get("holder_name")).startswith("sfms"):
             raise OutputError(f"app {lock.get('holder_name')} drives it: stop the app, or use reachy-mini-overlay")
         began_s = time.monotonic()
         neutral = {"head": np.eye(4).ravel(), "antennas": _REST_RAD, "body_yaw": 0.0}
-        link.send({"type": "goto_target", **neutral, "duration": self.neutral_s}, began_s, may_drop=False)
+        self.say({"type": "goto_target", **neutral, "duration": self.neutral_s})
         at = None
-        for message in link.until(began_s + self.neutral_s + _SETTLE_S):
+        for message in self.link.until(began_s + self.neutral_s + _SETTLE_S):
             at = _reported(message) if message.get("type") == "head_pose" else at
         if at is None:
             raise OutputError("reports no head_pose")
@@ -260,13 +260,13 @@ class ReachyMiniOverlay(ReachyDaemon):
         super().__init__(address)
         self._last = np.zeros(6)  # offset that the daemon may still have
 
-    def greet(self, link: WebSocketPeer) -> None:
+    def greet(self) -> None:
         """Ease an offset that is left from before a break in the network to 0."""
         self.check()
         steps = int(RATE_HZ) if self._last.any() else 1
         for left in self._last * (1.0 - ease(np.arange(1, steps + 1) / steps))[:, None]:
-            self._send(link, left)
-            deque(link.until(time.monotonic() + 1.0 / RATE_HZ), maxlen=0)
+            self._send(left)
+            deque(self.link.until(time.monotonic() + 1.0 / RATE_HZ), maxlen=0)
 
     def message(self, frame: OutputFrame, now_s: float) -> Message:
         return _offset(frame.motion[POSE].astype(np.float64))
@@ -275,18 +275,18 @@ class ReachyMiniOverlay(ReachyDaemon):
         self._last = frame.motion[POSE].astype(np.float64)
 
     def close(self) -> None:
-        if self.link is not None and self.link.closed:
+        if self._link is not None and self._link.closed:
             self._last = np.zeros(6)  # gone with the daemon
         super().close()
 
-    def farewell(self, link: WebSocketPeer) -> None:
+    def farewell(self) -> None:
         """Make an offset of nearly 0 exactly 0; that of a halted run stays with the daemon."""
         if np.abs(self._last).max() < _NEARLY_0:
-            self._send(link, np.zeros(6))
+            self._send(np.zeros(6))
 
-    def _send(self, link: WebSocketPeer, pose: Doubles) -> None:
+    def _send(self, pose: Doubles) -> None:
         self._last = pose
-        link.send(_offset(pose), time.monotonic(), may_drop=False)
+        self.say(_offset(pose))
 
 
 def _offset(pose: Doubles) -> Message:

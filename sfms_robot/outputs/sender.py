@@ -2,7 +2,7 @@
 
     MotionShaper    motion that an output shows, a value passed from step to step: no jump at start, end, halt, return
     OutputSender    one output: connect, shape, send, and connect again after a loss; time is an argument
-    OutputThread    its thread and its rate; takes the newest tick of the loop, which never waits
+    OutputThread    the same in a thread, at its rate; takes the newest tick of the loop, which never waits
     Outputs         all of a run
 
     phase        motion goes to                     when
@@ -90,27 +90,22 @@ class MotionShaper:
         """Return what is shown one period later. `target` (58,): of the phase "live"."""
         if phase != shown.phase:
             shown = replace(shown, phase=phase, since_s=now_s, origin=shown.motion)
-        if phase == "held":
-            return self._braked(shown)
-        aim = target if phase == "live" else np.zeros_like(target)
-        aim = np.where(np.isfinite(aim), aim, shown.motion)
-        share = np.float32(ease((now_s - shown.since_s) / EASE_S))
-        ahead = shown.origin + share * (aim - shown.origin)
+        ahead = shown.motion
+        if phase != "held":
+            aim = target if phase == "live" else np.zeros_like(target)
+            aim = np.where(np.isfinite(aim), aim, shown.motion)
+            share = np.float32(ease((now_s - shown.since_s) / EASE_S))
+            ahead = shown.origin + share * (aim - shown.origin)
         if self._limiter is None or shown.limiter is None:
             return replace(shown, motion=ahead)
-        before, here, next_ = np.stack([shown.before, shown.here, ahead])[:, self._columns].astype(np.float64)
-        values, limiter = self._limiter.step(difference(before, here, next_, self._period_s), shown.limiter)
         motion = ahead.copy()
-        motion[self._columns] = values
+        if phase == "held":
+            motion[self._columns], limiter = self._limiter.brake(shown.limiter)
+            return replace(shown, motion=motion, before=motion, here=motion, limiter=limiter)
+        before, here, next_ = np.stack([shown.before, shown.here, ahead])[:, self._columns].astype(np.float64)
+        reference = difference(before, here, next_, self._period_s)
+        motion[self._columns], limiter = self._limiter.step(reference, shown.limiter)
         return replace(shown, motion=motion, before=shown.here, here=ahead, limiter=limiter)
-
-    def _braked(self, shown: Shown) -> Shown:
-        if self._limiter is None or shown.limiter is None:
-            return shown
-        values, limiter = self._limiter.brake(shown.limiter)
-        motion = shown.motion.copy()
-        motion[self._columns] = values
-        return replace(shown, motion=motion, before=motion, here=motion, limiter=limiter)
 
 
 class OutputSender:
@@ -193,11 +188,11 @@ class OutputSender:
         if now_s - began_s >= _WINDOW_S:
             frames = self._counts["frames"]
             self._window = now_s, frames, (frames - before) / (now_s - began_s)
-        if self._pause_s != PAUSES_S[0] and now_s - self._opened_s > PROVEN_S:
+        if now_s - self._opened_s > PROVEN_S:
             self._pause_s = PAUSES_S[0]
-        if self.lost and now_s - self._opened_s > PROVEN_S:
-            self.lost, self._problem = False, None
-            logger.info("output %s: connected again", self.name)
+            if self.lost:
+                self.lost, self._problem = False, None
+                logger.info("output %s: connected again", self.name)
 
     def _lose(self, error: Exception, now_s: float) -> None:
         expected = isinstance(error, (OutputError, OSError))
@@ -214,11 +209,11 @@ class OutputSender:
         self._pause_s = min(2 * self._pause_s, PAUSES_S[1])
 
 
-class OutputThread(Observer):
-    """The thread of one output: sends the newest tick at the output's rate. `joints`: of `Tick.goals_rad`."""
+class OutputThread(OutputSender):
+    """An output in its thread: sends the newest tick at the output's rate. `joints`: of `Tick.goals_rad`."""
 
     def __init__(self, output: Output, joints: Sequence[str] = ()) -> None:
-        self.sender = OutputSender(output)
+        super().__init__(output)
         self._joints = tuple(joints)
         self._tick: Tick | None = None
         self._events: deque[ListenerEvent] = deque(maxlen=_MOST_EVENTS)
@@ -240,43 +235,37 @@ class OutputThread(Observer):
         """Return the frame of the newest tick; None before the first."""
         if (seen := self._tick) is None:
             return None
-        begun = []
-        for _ in range(len(self._events)):
-            event = self._events.popleft()
-            if event.start_s <= seen.time_s:
-                begun.append(event)
-            else:
-                self._events.append(event)
+        waiting = [self._events.popleft() for _ in range(len(self._events))]
+        self._events.extend(event for event in waiting if event.start_s > seen.time_s)
         return OutputFrame(
             time_s=seen.time_s,
             motion=seen.motion,
             state=seen.state,
-            events=tuple(begun),
+            events=tuple(event for event in waiting if event.start_s <= seen.time_s),
             goals_rad=seen.goals_rad,
             joints=self._joints,
         )
 
-    def close(self) -> None:
+    def end(self) -> None:
         """Begin to end: ease to neutral, disconnect. Returns at once; `join` waits."""
         self._closing.set()
 
     def join(self, limit_s: float) -> None:
-        """Wait for the end, after `close`."""
-        if self._thread.ident is not None:
-            self._thread.join(limit_s)
+        """Wait for the end, after `start` and `end`."""
+        self._thread.join(limit_s)
 
     def _work(self) -> None:
-        period_s = 1.0 / self.sender.output.rate_hz
+        period_s = 1.0 / self.output.rate_hz
         due_s = time.monotonic()
         while not self._closing.wait(max(0.0, due_s - time.monotonic())):
             now_s = time.monotonic()
-            self.sender.step(self.frame(), now_s)
+            self.step(self.frame(), now_s)
             due_s = max(due_s + period_s, now_s + period_s / 2)  # after a late frame the others are not made up for
         last_s, frame = time.monotonic() + LAST_S, self.frame()
-        while not self.sender.settled and (now_s := time.monotonic()) < last_s:
-            self.sender.step(frame, now_s, ending=True)
+        while not self.settled and (now_s := time.monotonic()) < last_s:
+            self.step(frame, now_s, ending=True)
             time.sleep(max(0.0, now_s + period_s - time.monotonic()))
-        self.sender.close()
+        self.close()
 
 
 class Outputs(Observer):
@@ -288,14 +277,14 @@ class Outputs(Observer):
 
     def __init__(self, outputs: Sequence[Output], joints: Sequence[str] = ()) -> None:
         self.threads = [OutputThread(output, joints) for output in outputs]
-        self.names = tuple(each.sender.name for each in self.threads)
+        self.names = tuple(each.name for each in self.threads)
         for thread in self.threads:
             thread.start()
 
     @property
     def missing(self) -> tuple[str, ...]:
         """Names of outputs whose peer is away."""
-        return tuple(each.sender.name for each in self.threads if each.sender.lost)
+        return tuple(each.name for each in self.threads if each.lost)
 
     def tick(self, seen: Tick) -> None:
         for thread in self.threads:
@@ -308,12 +297,12 @@ class Outputs(Observer):
 
     def statistics(self) -> list[Facts]:
         """Return the figures of each output, as `OutputSender.statistics`."""
-        return [thread.sender.statistics() for thread in self.threads]
+        return [thread.statistics() for thread in self.threads]
 
     def close(self) -> None:
         """Lead all outputs to neutral and disconnect them, side by side. Blocks `LAST_S` at most. Idempotent."""
         for thread in self.threads:
-            thread.close()
+            thread.end()
         until_s = time.monotonic() + LAST_S
         for thread in self.threads:
             thread.join(max(0.0, until_s - time.monotonic()))

@@ -29,7 +29,7 @@ import numpy as np
 from sfms_robot.data import user_dir
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Floats
-from sfms_robot.outputs.websocket_peer import Message, WebSocketOutput, WebSocketPeer
+from sfms_robot.outputs.websocket_peer import Message, WebSocketOutput
 from sfms_robot.ports import Facts, OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 
@@ -101,14 +101,14 @@ class VtubeStudio(WebSocketOutput):
         self._since_s: float | None = None  # of the first frame
         self._asked_s: float | None = None  # of the oldest request without an answer; None for the user's window
 
-    def greet(self, link: WebSocketPeer) -> None:
+    def greet(self) -> None:
         if self._denied:
             raise OutputError("its user denied access: start the run again to be asked again")
         self._access, self._since_s, self._asked_s = False, None, None
         if (token := self._token()) is not None:
-            self._authenticate(link, token)
+            self._authenticate(token)
         else:
-            self._ask(link)
+            self._ask()
 
     def message(self, frame: OutputFrame, now_s: float) -> Message | None:
         if not self._access:
@@ -140,20 +140,18 @@ class VtubeStudio(WebSocketOutput):
         return {**super().statistics(), "access": self._access}
 
     def _answered(self, kind: str, data: Message) -> None:
-        link = self.link
-        assert link is not None
         if kind == "AuthenticationTokenResponse":
             token = str(data.get("authenticationToken", ""))
             if not re.fullmatch(r"[!-~]{1,64}", token):
                 raise OutputError(f"gives {token[:64]!r}, which is not a token")
             self._keep(token)
-            self._authenticate(link, token)
+            self._authenticate(token)
         elif kind == "AuthenticationResponse" and data.get("authenticated"):
             self._access = True
         elif kind == "AuthenticationResponse":
             logger.info("output %s:%s: the kept token is not valid any more", self.kind, self.peer)
             self._file.unlink(missing_ok=True)
-            self._ask(link)
+            self._ask()
         elif kind == "APIError":
             self._denied = data.get("errorID") == _DENIED
             hints = {
@@ -164,14 +162,14 @@ class VtubeStudio(WebSocketOutput):
             text = " ".join(str(data.get("message")).split()).rstrip(".")
             raise OutputError(f"{text} (error {data.get('errorID')}){hints.get(data.get('errorID', -1), '')}")
 
-    def _ask(self, link: WebSocketPeer) -> None:
+    def _ask(self) -> None:
         self.note_once("click Allow in the window that VTube Studio shows now")
-        link.send(_request("AuthenticationToken", PLUGIN), link.heard_s, may_drop=False)
+        self.say(_request("AuthenticationToken", PLUGIN))
 
-    def _authenticate(self, link: WebSocketPeer, token: str) -> None:
-        self._asked_s = link.heard_s
+    def _authenticate(self, token: str) -> None:
+        self._asked_s = self.link.heard_s
         data = {**PLUGIN, "authenticationToken": token}
-        link.send(_request("Authentication", data), link.heard_s, may_drop=False)
+        self.say(_request("Authentication", data))
 
     def _token(self) -> str | None:
         try:

@@ -234,48 +234,54 @@ class WebSocketOutput(Output):
     def __init__(self, address: str) -> None:
         self.host, self.port = parse_address(self.kind, address, self.usual_port)
         self.peer = address_text(self.host, self.port)
-        self.link: WebSocketPeer | None = None
+        self._link: WebSocketPeer | None = None
         self._dropped = 0  # on connections before
         self._counts = (0, 0)  # sent and dropped frames when a slow peer was looked for last
         self._noted: set[str] = set()
 
+    @property
+    def link(self) -> WebSocketPeer:
+        """The connection. Raises OutputError where there is none."""
+        if self._link is None:
+            raise OutputError("is not connected")
+        return self._link
+
     def open(self) -> None:
-        self.link = link = WebSocketPeer(self.host, self.port, self.path, self.absent)
+        self._link = WebSocketPeer(self.host, self.port, self.path, self.absent)
         self._counts = (0, 0)
         try:
-            self.greet(link)
+            self.greet()
         except BaseException:
             self.close()
             raise
 
     def send(self, frame: OutputFrame, now_s: float) -> None:
-        if (link := self.link) is None:
-            raise OutputError("is not connected")
+        link = self.link
         self.heard(link.receive(), now_s)
         if self.answers and now_s - link.heard_s > SILENT_S:
             raise OutputError(f"has sent nothing for {SILENT_S:g} s")
         message = self.message(frame, now_s)
         if message is not None and link.send(message, now_s):
             self.shown(frame, now_s)
-        self._note_slow(link)
+        self._note_slow()
 
     def statistics(self) -> Facts:
         """Return the frames that a slow peer missed."""
-        link = self.link
+        link = self._link
         return {"dropped": self._dropped + (link.dropped if link else 0)}
 
     def close(self) -> None:
         """Say the last message where the peer is there, and disconnect. Idempotent."""
-        if (link := self.link) is None:
+        if (link := self._link) is None:
             return
-        self.link = None
-        self._dropped += link.dropped
         with suppress(OutputError, OSError):
             if not link.closed:
-                self.farewell(link)
+                self.farewell()
+        self._link = None
+        self._dropped += link.dropped
         link.close()
 
-    def greet(self, link: WebSocketPeer) -> None:
+    def greet(self) -> None:
         """Lead the peer to neutral over a new connection. Raises OutputError."""
         raise NotImplementedError
 
@@ -289,8 +295,12 @@ class WebSocketOutput(Output):
     def shown(self, frame: OutputFrame, now_s: float) -> None:
         """Note that a frame was sent."""
 
-    def farewell(self, link: WebSocketPeer) -> None:
+    def farewell(self) -> None:
         """Send the last message of a connection."""
+
+    def say(self, message: Message) -> None:
+        """Send a message that is not left out where the network is slow."""
+        self.link.send(message, time.monotonic(), may_drop=False)
 
     def note_once(self, text: str) -> None:
         """Log a warning of this output, the first time."""
@@ -298,8 +308,9 @@ class WebSocketOutput(Output):
             self._noted.add(text)
             logger.warning("output %s:%s: %s", self.kind, self.peer, text)
 
-    def _note_slow(self, link: WebSocketPeer) -> None:
+    def _note_slow(self) -> None:
         """Report once that the peer takes fewer than three of four frames."""
+        link = self.link
         sent, dropped = link.sent - self._counts[0], link.dropped - self._counts[1]
         if sent + dropped < _SHARE_WINDOW:
             return

@@ -401,7 +401,7 @@ def test_no_program_and_no_host_are_one_line(monkeypatch):
 class Plain(Furhat):
     """An output without a greeting."""
 
-    def greet(self, link):
+    def greet(self):
         return
 
 
