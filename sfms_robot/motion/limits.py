@@ -195,22 +195,19 @@ class JerkLimiter:
         """Return the state at rest at `angles_rad` (J,), in range or not. Raises ValueError if one is not finite."""
         if not np.isfinite(angles_rad).all():
             raise ValueError(f"joint {int(np.argmin(np.isfinite(angles_rad)))} starts at an angle that is not finite")
-        still = np.zeros_like(self._own.low)
-        return self._found(LimiterState(np.stack([angles_rad, still, still])), np.ones(len(still), np.bool_))
+        nowhere = LimiterState(np.zeros((3, len(angles_rad))))
+        return self.restart(np.ones(len(angles_rad), np.bool_), angles_rad, nowhere)
 
     def restart(self, joints: Bools, angles_rad: Doubles, state: LimiterState) -> LimiterState:
         """Return the state with some `joints` (J,) at rest at `angles_rad` (J,), in range or not."""
         # Torque was off meanwhile: whatever speed the joint had by the last command is gone.
         still = np.zeros_like(angles_rad)
         motion = np.where(joints, np.stack([angles_rad, still, still]), state.motion)
-        return self._found(replace(state, motion=motion), joints)
-
-    def _found(self, state: LimiterState, joints: Bools) -> LimiterState:
-        angles_rad = state.motion[0]
-        if self._own.holds(angles_rad).all():
-            return replace(state, recovery=None)
-        found = Recovery.of(angles_rad, self._own, self._speed, self._acceleration, self._jerk)
-        return replace(state, recovery=found if state.recovery is None else state.recovery.replaced(joints, found))
+        if self._own.holds(motion[0]).all():
+            return replace(state, motion=motion, recovery=None)
+        found = Recovery.of(motion[0], self._own, self._speed, self._acceleration, self._jerk)
+        recovery = found if state.recovery is None else state.recovery.replaced(joints, found)
+        return replace(state, motion=motion, recovery=recovery)
 
     def step(self, reference_rad: Doubles, state: LimiterState) -> tuple[Doubles, LimiterState]:
         """Return angles (J,) that may be sent for a reference (3, J) one tick ahead, and the state after the tick."""

@@ -140,11 +140,10 @@ class PlanTimeline:
 
     def accept(self, plan: Plan, state: TimelineState) -> TimelineState:
         """Return the state with `plan` joined on; an unusable plan is counted in `refused` and raises nothing."""
-        old = state.curve
-        if not _usable(plan) or (old is not None and plan.made_at_s < old.made_at_s):
+        old, usable = state.curve, _usable(plan)
+        if usable is None or (old is not None and plan.made_at_s < old.made_at_s):
             return replace(state, refused=state.refused + 1)
-        times_s = np.asarray(plan.times_s, dtype=np.float64)
-        frames = _frames(plan)
+        times_s, frames = usable
         step_s = float(times_s[1] - times_s[0]) if len(times_s) > 1 else FRAME_S
 
         delay_s = FRAME_S if len(times_s) == 1 else 0.0
@@ -175,7 +174,10 @@ class PlanTimeline:
 
         `now_s` is the time of the tick; instants after it are leads.
         """
-        curve, limit_s = state.curve, _lead_limit_s(now_s, state)
+        # The limit of leads comes a little nearer to the time left of plans.
+        dt_s = max(now_s - state.now_s, 0.0) if math.isfinite(state.now_s) else 0.0
+        limit_s = min(max(state.left_s, state.lead_limit_s - FALL * dt_s), state.lead_limit_s + RISE * dt_s)
+        curve, limit_s = state.curve, max(limit_s, 0.0)
         played_s = max(state.played_s, float(times_s.max()) - (curve.delay_s if curve else 0.0))
         if curve is None:
             after = replace(state, played_s=played_s, now_s=now_s, lead_limit_s=limit_s)
@@ -201,13 +203,6 @@ class PlanTimeline:
         return blinks * (near & (nearest >= 0) & (asked_s - curve.made_at_s < STALL_S))[:, None]
 
 
-def _lead_limit_s(now_s: float, state: TimelineState) -> float:
-    """Return the limit of leads at the next tick, a little nearer to the time left of plans."""
-    dt_s = max(now_s - state.now_s, 0.0) if math.isfinite(state.now_s) else 0.0
-    limit_s = min(max(state.left_s, state.lead_limit_s - FALL * dt_s), state.lead_limit_s + RISE * dt_s)
-    return max(limit_s, 0.0)
-
-
 def _distinct(times_s: Doubles) -> tuple[Doubles, Indices]:
     """Return the instants, each once, and the place of each of (N,) among them: joints share their leads."""
     seen: dict[float, int] = {}
@@ -222,30 +217,23 @@ def _blend(before: Doubles, after: Doubles, share: float) -> Doubles:
     return blend
 
 
-def _usable(plan: Plan) -> bool:
-    """Return whether a plan is finite, in time order and 58 wide."""
-    frames, times_s = np.asarray(plan.frames), np.asarray(plan.times_s)
-    shaped = times_s.ndim == 1 and len(times_s) > 0 and frames.shape == (len(times_s), MOTION_DIM)
-    jaw_ok = plan.jaw_rad is None or bool(np.isfinite(plan.jaw_rad).all())
-    return (
-        shaped
-        and bool(np.isfinite(frames).all() and np.isfinite(times_s).all() and (np.diff(times_s) > 0).all())
-        and jaw_ok
-        and math.isfinite(plan.made_at_s)
-    )
+def _usable(plan: Plan) -> tuple[Doubles, Doubles] | None:
+    """Return times (H,) and frames (H, 58) of a plan; None for one that is not finite, in time order and 58 wide.
 
-
-def _frames(plan: Plan) -> Doubles:
-    """Return frames (H, 58) with blendshapes in 0..1, and the jaw pose, if any, in the place of jawOpen.
-
-    A pose is cut to `_FARTHEST`, so that no curve through it overflows.
+    Blendshapes are in 0..1, and the jaw pose, if any, in the place of jawOpen. A pose is cut to `_FARTHEST`, so that no
+    curve through it overflows.
     """
-    frames = np.array(plan.frames, dtype=np.float64)
+    times_s, frames = np.asarray(plan.times_s, dtype=np.float64), np.array(plan.frames, dtype=np.float64)
+    if times_s.ndim != 1 or not len(times_s) or frames.shape != (len(times_s), MOTION_DIM):
+        return None
+    numbers = (times_s, frames, np.asarray(plan.made_at_s), np.zeros(0) if plan.jaw_rad is None else plan.jaw_rad)
+    if not all(np.isfinite(each).all() for each in numbers) or (np.diff(times_s) <= 0).any():
+        return None
     if plan.jaw_rad is not None:  # axis-angle; y points left, so + about y lowers the chin
         frames[:, _JAW_OPEN] = plan.jaw_rad[:, 1] / JAW_FULL_OPEN_RAD
     frames[:, SHAPES] = np.clip(frames[:, SHAPES], 0.0, 1.0)
     frames[:, POSE] = np.clip(frames[:, POSE], -_FARTHEST, _FARTHEST)
-    return frames
+    return times_s, frames
 
 
 def _past(old: Curve | None, played_s: float, first_s: float, step_s: float) -> tuple[_Knots, bool]:
