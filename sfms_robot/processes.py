@@ -447,26 +447,17 @@ def give_way(nice: int) -> None:
 
 
 @contextmanager
-def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables while something reads them, and restore them. Not for several threads."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
-@contextmanager
 def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
     """Start a pool whose processes compute with one thread each. On leaving, tasks that have not begun are dropped."""
-    with environment(ONE_THREAD):  # a pool starts its processes as tasks come, with the environment of that moment
-        pool = ProcessPoolExecutor(processes, get_context("spawn"))  # torch's threads do not survive a fork
-        try:
-            yield pool
-        finally:
-            pool.shutdown(cancel_futures=True)
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(ONE_THREAD)  # a pool starts its processes as tasks come, with the environment of that moment
+    pool = ProcessPoolExecutor(processes, get_context("spawn"))  # torch's threads do not survive a fork
+    try:
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def cores() -> int:

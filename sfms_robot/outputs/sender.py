@@ -137,7 +137,9 @@ class OutputSender:
     def step(self, frame: OutputFrame | None, now_s: float, ending: bool = False) -> None:
         """Send a frame, or connect. `frame`: None before the first tick. Never raises; blocks as the output does."""
         frame = frame or OutputFrame(time_s=0.0, motion=np.zeros(MOTION_DIM, np.float32))
-        phase = self._phase(frame.state, ending)
+        phase: Phase = "neutral" if ending or frame.state in ("starting", "halted") else "live"
+        if frame.state == "halted" and self.output.moves:  # the end of a halted run moves nothing either
+            phase = "held"
         if self.shown is None and (ending or phase == "held" or now_s < self._retry_s):
             return  # to connect would move a halted machine
         try:
@@ -176,11 +178,6 @@ class OutputSender:
         except Exception:  # of a plug-in: any
             logger.info("output %s raised", self.name, exc_info=True)
             return {}
-
-    def _phase(self, state: str, ending: bool) -> Phase:
-        if state == "halted" and self.output.moves:  # the end of a halted run moves nothing either
-            return "held"
-        return "neutral" if ending or state in ("starting", "halted") else "live"
 
     def _sent(self, now_s: float) -> None:
         self._counts["frames"] += 1

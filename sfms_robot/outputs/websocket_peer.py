@@ -63,7 +63,6 @@ class WebSocketPeer:
         self._out = bytearray()
         self._parts: list[bytes | bytearray | memoryview] = []
         self._messages: list[bytes] = []
-        self._open = False
         self._end: OutputError | None = None
         self._protocol = ClientProtocol(parse_uri(f"ws://{address_text(host, port)}{path}"))
         try:
@@ -75,7 +74,7 @@ class WebSocketPeer:
         self._protocol.send_request(self._protocol.connect())
         try:
             until_s = time.monotonic() + CONNECT_S
-            while not self._open:
+            while self._protocol.state is State.CONNECTING:
                 if (left_s := until_s - time.monotonic()) <= 0:
                     raise OutputError(f"a program listens there, but does not answer within {CONNECT_S:g} s")
                 self._exchange(left_s)
@@ -155,26 +154,20 @@ class WebSocketPeer:
     def _take(self, data: bytes) -> None:
         self._protocol.receive_data(data)
         for event in self._protocol.events_received():
-            if isinstance(event, Frame):
-                self._frame(event)
+            if isinstance(event, Frame) and event.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+                self._parts.append(event.data)
+                if event.fin:
+                    self._messages.append(b"".join(self._parts))
+                    self._parts.clear()
+                    self.heard_s = time.monotonic()
         if (problem := self._protocol.handshake_exc) is not None:
             answer = f"HTTP {problem.response.status_code}" if isinstance(problem, InvalidStatus) else "other bytes"
             path = self._protocol.uri.path
             raise OutputError(f"the program that listens there has no WebSocket at {path}: it answers {answer}")
-        self._open = self._protocol.state is not State.CONNECTING
         if self._protocol.parser_exc is not None:
             raise OutputError("answers with bytes that are not of a WebSocket")
         if self._protocol.close_rcvd is not None:
             raise self._gone()
-
-    def _frame(self, frame: Frame) -> None:
-        if frame.opcode not in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
-            return
-        self._parts.append(frame.data)
-        if frame.fin:
-            self._messages.append(b"".join(self._parts))
-            self._parts.clear()
-            self.heard_s = time.monotonic()
 
     def _flush(self) -> None:
         for data in self._protocol.data_to_send():

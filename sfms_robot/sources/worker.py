@@ -83,8 +83,13 @@ class SourceWorker:
         if any(message[0] == "finished" for message in messages):
             self._ended = "finished"
         if self._ended is None:
-            failures = [failure for failure in map(_failure, messages) if failure is not None]
-            self._check(now_s, failures[0] if failures else None)
+            failure = next(filter(None, map(_failure, messages)), None)
+            alive = child.gave_sign()
+            if alive and failure is None and self._supervised.phase == "starting":
+                self._supervised.enter("running")
+            self._supervised.check(now_s, alive, None if failure is None else str(failure))
+            if self._supervised.child is not child:
+                self._dropped += child.dropped
         return [message[1] for message in messages if message[0] == "value"]
 
     @property
@@ -111,15 +116,6 @@ class SourceWorker:
         if self._sent is not None:
             child.offer(self._sent)
         return child
-
-    def _check(self, now_s: float, failure: RobotError | str | None) -> None:
-        child = self._supervised.child
-        alive = child.gave_sign()
-        if alive and failure is None and self._supervised.phase == "starting":
-            self._supervised.enter("running")
-        self._supervised.check(now_s, alive, None if failure is None else str(failure))
-        if self._supervised.child is not child:
-            self._dropped += child.dropped
 
 
 def _failure(message: Any) -> RobotError | str | None:
