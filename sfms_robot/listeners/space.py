@@ -35,7 +35,6 @@ from sfms_robot.frames import (
     Plan,
 )
 from sfms_robot.signals.rotations import angles_of, from_vector, rotation
-from sfms_robot.signals.spaces import bounded_least_squares
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,6 +224,33 @@ _SIDES: Final = [
     for i, name in enumerate(BLENDSHAPES)
     if name.endswith("Left") and name.removesuffix("Left") not in ("jaw", "mouth") and not name.startswith("eyeLook")
 ]
+_STEPS: Final = 400
+_SETTLED: Final = 1e-8  # largest change of an unknown in one step
+
+
+def bounded_least_squares(matrix: Doubles, wanted: Doubles, low: Doubles, high: Doubles) -> Doubles:
+    """Return the x (N, n), low <= x <= high, with the least ||matrix x - wanted||^2, per row of `wanted` (N, m).
+
+    matrix (m, n) of full column rank (add rows of a ridge where it is not); low, high (n,) or (N, n). Accelerated
+    projected gradient with restarts (O'Donoghue and Candes 2015): every step is one matrix product for all N.
+    """
+    gram = matrix.T @ matrix
+    target = wanted @ matrix  # (N, n)
+    step = 1.0 / float(np.linalg.eigvalsh(gram)[-1])
+    here: Doubles = np.clip(np.linalg.solve(gram, target.T).T, low, high)
+    ahead, momentum = here, np.ones((len(wanted), 1))
+    for _ in range(_STEPS):
+        slope = ahead @ gram - target
+        there: Doubles = np.clip(ahead - step * slope, low, high)
+        moved = there - here
+        uphill = (slope * moved).sum(axis=1, keepdims=True) > 0
+        momentum = np.where(uphill, 1.0, momentum)
+        following = (1.0 + np.sqrt(1.0 + 4.0 * momentum**2)) / 2.0
+        ahead = there + np.where(uphill, 0.0, (momentum - 1.0) / following) * moved
+        here, momentum = there, following
+        if np.abs(moved).max(initial=0.0) < _SETTLED:
+            break
+    return here
 
 
 @dataclass(frozen=True)

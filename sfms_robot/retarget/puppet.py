@@ -25,9 +25,9 @@ import numpy as np
 from sfms_robot.config import Gaze
 from sfms_robot.errors import InputError
 from sfms_robot.frames import CHANNELS, MOTION_DIM, POSE, SHAPES, YAW_PITCH, Bools, Doubles, Floats
+from sfms_robot.signals.face_units import channel_of, motion_of
 from sfms_robot.signals.gaze_kinematics import direction_to, directions, turn
 from sfms_robot.signals.minimum_jerk import ease
-from sfms_robot.signals.spaces import channel_of, motion_of
 
 RISE_S: Final = 0.25  # listener -> face
 CHANGE_S: Final = 0.12  # one face asked for -> the next; straight, so that a stream of them flows

@@ -7,7 +7,8 @@ import logging
 import math
 import os
 import struct
-from contextlib import closing
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -246,6 +247,18 @@ def check_scale(name: str, samples: NDArray[Any]) -> None:
     peak = float(np.abs(samples).max(initial=0.0, where=np.isfinite(samples)))
     if peak > LOUDEST:
         raise InputError(f"{name}: holds samples up to {peak:g}, full scale is 1: divide them (16-bit: by 32768)")
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables while a library of sound reads them, and restore them. Not for several threads."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
 def energy_db(samples: Floats) -> float:

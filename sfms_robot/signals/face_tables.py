@@ -23,8 +23,8 @@ import numpy as np
 from sfms_robot.data import archive_kind
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
+from sfms_robot.signals.face_units import channel_of
 from sfms_robot.signals.rotations import about, angles_of, camera_angles
-from sfms_robot.signals.spaces import channel_of
 
 logger = logging.getLogger(__name__)
 

@@ -44,7 +44,7 @@ def mfcc78(samples: Floats) -> Floats:
 def cepstra(windows: NDArray[np.floating]) -> Doubles:
     """Return (..., 13) of windows (..., 400): Kaldi's defaults with energy in place of the first."""
     centred = windows - windows.mean(axis=-1, keepdims=True)
-    energy = np.log(np.maximum(np.square(centred).sum(axis=-1), max(ENERGY_FLOOR, EPSILON)))
+    energy = np.log(np.maximum(np.square(centred).sum(axis=-1), ENERGY_FLOOR))
     before = np.concatenate([centred[..., :1], centred[..., :-1]], axis=-1)
     povey = np.hanning(WINDOW) ** 0.85
     power = np.abs(np.fft.rfft((centred - PREEMPHASIS * before) * povey, FFT)) ** 2

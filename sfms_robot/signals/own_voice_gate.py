@@ -27,8 +27,7 @@ from numpy.typing import ArrayLike
 
 from sfms_robot.errors import InputError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
-from sfms_robot.processes import environment
-from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.audio import energy_db, environment
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
 
 if TYPE_CHECKING:

@@ -1,8 +1,9 @@
 """Face-track files: CSV (also gzipped), JSON and OpenFace's, read as motion in our units and axes.
 
-Columns go by name (`spaces.channel_of`), so the column order of the Live Link app, of its UDP packet, of Apple's header
-and of MediaPipe all read the same. Head pose columns carry their unit in the name (`headYaw_deg`, `x_m`, ...); without
-one angles are radians or degrees by what a head can do, and places metres. Axes of other sources are turned into ours.
+Columns go by name (`face_units.channel_of`), so the column order of the Live Link app, of its UDP packet, of Apple's
+header and of MediaPipe all read the same. Head pose columns carry their unit in the name (`headYaw_deg`, `x_m`, ...);
+without one angles are radians or degrees by what a head can do, and places metres. Axes of other sources are turned
+into ours.
 
 A row of NaN means: no face was seen.
 """
@@ -43,7 +44,7 @@ from sfms_robot.signals.face_tables import (
     row_times,
     time_column,
 )
-from sfms_robot.signals.spaces import channel_of, expected_unit, face_bounds, pose_of, units_of, used_line
+from sfms_robot.signals.face_units import channel_of, expected_unit, face_bounds, pose_of, units_of, used_line
 
 logger = logging.getLogger(__name__)
 
@@ -70,10 +71,6 @@ class _Column(NamedTuple):
 
     place: int
     factor: float
-
-
-_Columns = Mapping[str, _Column]
-_Rows = Sequence[Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,14 @@ def read_track(path: Path | str) -> Track:
         motion[:, CHANNEL_INDEX[channel]] = values if math.isnan(column.factor) else column.factor * values
     motion[np.isnan(motion).any(axis=1)] = np.nan
     motion = _in_our_units(file, motion, times_s, columns)
-    _check_ranges(file, header, rows, motion, columns)
+    low, high = face_bounds(_MOST_TURN_RAD)
+    if outside := np.argwhere((motion < low) | (motion > high)).tolist():  # most likely in another unit
+        row, place = outside[0]
+        column = columns[CHANNELS[place]].place
+        cell, unit = rows[row][column], "" if place > 5 else "; a name such as yaw_deg, x_cm has its unit"
+        raise ConfigError(
+            f"{file}: row {row + 2}, column {header[column]}: expected {expected_unit(place)}, got {cell}{unit}"
+        )
     if from_camera and np.isfinite(motion[:, 0]).any():
         motion[:, _PLACE] -= np.nanmedian(motion[:, _PLACE], axis=0)
     motion[:, SHAPES] = np.clip(motion[:, SHAPES], 0.0, 1.0)
@@ -225,7 +229,7 @@ def _columns(file: Path, header: Sequence[str]) -> tuple[dict[str, _Column], boo
     return columns, from_camera
 
 
-def _in_our_units(file: Path, motion: Doubles, times_s: Doubles, columns: _Columns) -> Doubles:
+def _in_our_units(file: Path, motion: Doubles, times_s: Doubles, columns: Mapping[str, _Column]) -> Doubles:
     """Return motion (N, 58) in radians and 0..1: units that no name declares are decided over all rows."""
     is_open = np.array([name in columns and math.isnan(columns[name].factor) for name in _ANGLES])
     undecided, angles = motion.copy(), slice(0, len(_ANGLES))
@@ -236,19 +240,6 @@ def _in_our_units(file: Path, motion: Doubles, times_s: Doubles, columns: _Colum
     if units.line:
         logger.warning("%s: %s, by what a head can do (names with a unit: headYaw_deg, yaw_rad)", file, units.line)
     return motion
-
-
-def _check_ranges(file: Path, header: Sequence[str], rows: _Rows, motion: Doubles, columns: _Columns) -> None:
-    """Raise ConfigError for a value beyond its bounds, with row and column: most likely it is in another unit."""
-    low, high = face_bounds(_MOST_TURN_RAD)
-    outside = np.argwhere((motion < low) | (motion > high)).tolist()
-    if outside:
-        row, place = outside[0]
-        column = columns[CHANNELS[place]].place
-        cell, unit = rows[row][column], "" if place > 5 else "; a name such as yaw_deg, x_cm has its unit"
-        raise ConfigError(
-            f"{file}: row {row + 2}, column {header[column]}: expected {expected_unit(place)}, got {cell}{unit}"
-        )
 
 
 @dataclass(frozen=True)

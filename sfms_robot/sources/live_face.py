@@ -36,8 +36,8 @@ from sfms_robot.frames import (
     Floats,
     Sighting,
 )
+from sfms_robot.signals.face_units import LiveUnits, beyond
 from sfms_robot.signals.rotations import angles_of, rotation
-from sfms_robot.signals.spaces import LiveUnits, beyond
 from sfms_robot.sources.live_voice import Clock, SourcePart
 
 logger = logging.getLogger(__name__)

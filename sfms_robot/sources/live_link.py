@@ -11,7 +11,7 @@ One packet a frame, big-endian:
     float32 52 blendshapes in the order "live_link_udp"; head yaw, pitch, roll; yaw, pitch, roll of each eye [rad]
 
 The head's angles turn as ours do, which is not proved (`signals.tracks`). Some senders write them in degrees, which is
-decided over the first second (`signals.spaces`). Only what a face needs is judged: 52 blendshapes, three angles.
+decided over the first second (`signals.face_units`). Only what a face needs is judged: 52 blendshapes, three angles.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, Floats
-from sfms_robot.signals.spaces import LiveUnits
+from sfms_robot.signals.face_units import LiveUnits
 from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
 
 VERSION: Final = 6

@@ -32,7 +32,7 @@ from sfms_robot.config.base import PRINTABLE, one_line
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import MOTION_DIM, Floats
 from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ
-from sfms_robot.signals.spaces import beyond
+from sfms_robot.signals.face_units import beyond
 
 VERSION: Final = 1
 VOICE, FACE, SPEECH, MICROPHONE = 1, 2, 3, 4

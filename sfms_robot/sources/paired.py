@@ -38,8 +38,8 @@ from sfms_robot.frames import (
 )
 from sfms_robot.ports import Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
+from sfms_robot.signals.face_units import beyond
 from sfms_robot.signals.quantiles import Quantiles
-from sfms_robot.signals.spaces import beyond
 from sfms_robot.sources.live_voice import Pace
 
 logger = logging.getLogger(__name__)

@@ -21,7 +21,7 @@ from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, NO_SOUND, FaceFrame, Floats, Sighting
 from sfms_robot.ports import Voice
 from sfms_robot.signals.audio import Downmix, Resampler, check_scale
-from sfms_robot.signals.spaces import beyond, motion_of
+from sfms_robot.signals.face_units import beyond, motion_of
 from sfms_robot.sources.live_voice import Clock, LiveVoice, Pace, SourcePart, check_rate, window
 
 Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]

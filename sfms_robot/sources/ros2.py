@@ -19,8 +19,8 @@ from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, SHAPES, Floats, Sighting
 from sfms_robot.network import LOCAL, Ros2Node, Router, ros_domain, ros_topic
+from sfms_robot.signals.face_units import beyond
 from sfms_robot.signals.ros2_messages import ACTION_UNITS, AUDIO, Message, face_of, read_message, wire_name
-from sfms_robot.signals.spaces import beyond
 from sfms_robot.sources.live_face import LOST_S, UNHEARD_S, LiveFace, parse_face_argument
 from sfms_robot.sources.live_voice import SourcePart, check_rate
 from sfms_robot.sources.push import PushedVoice

@@ -22,7 +22,7 @@ import numpy as np
 from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
-from sfms_robot.processes import environment
+from sfms_robot.signals.audio import environment
 from sfms_robot.sources.live_voice import LiveVoice, Pace
 from sfms_robot.sources.worker import SourceWorker
 

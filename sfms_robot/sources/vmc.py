@@ -8,8 +8,8 @@ Read (protocol.vmc.info, "Marionette" specification), alone or in bundles:
     /VMC/Ext/Bone/Pos    name, position, quaternion  of bones "Head" and "Neck", each against its parent
     /VMC/Ext/OK          loaded, ..., tracking       tracking 0: the face is lost
 
-Names go by any spelling that `signals.spaces.channel_of` knows. A sender whose ARKit shapes move is believed in these;
-the presets of another become the ARKit shapes nearest to them. Values above 1 are percent, where they stay so.
+Names go by any spelling that `signals.face_units.channel_of` knows. A sender whose ARKit shapes move is believed in
+these; the presets of another become the ARKit shapes nearest to them. Values above 1 are percent, where they stay so.
 
 Unity's axes are left-handed, x right, y up, z forward as the avatar has them; a rotation about (x, y, z) there is one
 about (-z, x, -y) in ours. That follows from the two definitions; whether an avatar mirrors its person is a setting of
@@ -33,8 +33,8 @@ import numpy as np
 from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats
+from sfms_robot.signals.face_units import LiveUnits, channel_of, used_line
 from sfms_robot.signals.rotations import angles_of
-from sfms_robot.signals.spaces import LiveUnits, channel_of, used_line
 from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
 
 # The ARKit shapes nearest to a preset of VRM 0 and 1.

@@ -8,7 +8,7 @@ from tiny_sfms import plans_of, speech, tiny_listener, tiny_settings
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, JAW_FULL_OPEN_RAD, ORDERS, SHAPES, SPACE_CHANNELS
-from sfms_robot.listeners.space import SPACES, FlameMatrix, MotionSpace, read_matrix
+from sfms_robot.listeners.space import SPACES, FlameMatrix, MotionSpace, bounded_least_squares, read_matrix
 
 RNG = np.random.default_rng(5)
 MATRIX = RNG.normal(size=(52, 50))
@@ -96,6 +96,16 @@ def test_solved_weights_are_bounded_and_gaze_stays_still():
     weights = FlameMatrix(MATRIX).solve(RNG.normal(scale=5, size=(20, 50)), np.zeros(20))
     assert weights.min() >= 0 and weights.max() <= 1
     assert not weights[:, [name.startswith("eyeLook") for name in BLENDSHAPES]].any()
+
+
+def test_bounded_solution_cannot_be_bettered():
+    """Where an unknown is free its slope is 0; at a bound the slope points outward (the optimality conditions)."""
+    matrix, wanted = RNG.normal(size=(30, 8)), RNG.normal(scale=3, size=(25, 30))
+    x = bounded_least_squares(matrix, wanted, np.full(8, -0.2), np.full(8, 0.5))
+    slope = (x @ matrix.T - wanted) @ matrix
+    at_low, at_high = x <= -0.2, x >= 0.5
+    assert np.abs(slope[~at_low & ~at_high]).max() < 1e-4
+    assert (slope[at_low] > -1e-4).all() and (slope[at_high] < 1e-4).all()
 
 
 def test_matrix_files_of_both_kinds_are_the_same_matrix(tmp_path):

@@ -1,22 +1,10 @@
-"""Names and units of faces that come from elsewhere, and least squares within bounds."""
+"""Names and units of faces that come from elsewhere."""
 
 import numpy as np
 import pytest
 
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX
-from sfms_robot.signals import spaces
-
-RNG = np.random.default_rng(5)
-
-
-def test_bounded_solution_cannot_be_bettered():
-    """Where an unknown is free its slope is 0; at a bound the slope points outward (the optimality conditions)."""
-    matrix, wanted = RNG.normal(size=(30, 8)), RNG.normal(scale=3, size=(25, 30))
-    x = spaces.bounded_least_squares(matrix, wanted, np.full(8, -0.2), np.full(8, 0.5))
-    slope = (x @ matrix.T - wanted) @ matrix
-    at_low, at_high = x <= -0.2, x >= 0.5
-    assert np.abs(slope[~at_low & ~at_high]).max() < 1e-4
-    assert (slope[at_low] > -1e-4).all() and (slope[at_high] < 1e-4).all()
+from sfms_robot.signals import face_units
 
 
 @pytest.mark.parametrize(
@@ -36,15 +24,15 @@ def test_bounded_solution_cannot_be_bettered():
     ],
 )
 def test_a_channel_goes_by_every_spelling(name, channel):
-    assert spaces.channel_of(name) == channel
+    assert face_units.channel_of(name) == channel
 
 
 def test_every_shape_has_its_short_name_and_what_is_left_out_is_counted_and_named():
     for name in BLENDSHAPES:
         short = name.replace("Left", "_L").replace("Right", "_R")
-        assert spaces.channel_of(f"ARKit.{short}") == spaces.channel_of(name.upper()) == name
-    assert spaces.used_line(["jawOpen", "yaw"], ["b", "a"]) == "1 of 52 channels used; not known: a, b"
-    assert spaces.used_line(BLENDSHAPES, []) == "52 of 52 channels used"
+        assert face_units.channel_of(f"ARKit.{short}") == face_units.channel_of(name.upper()) == name
+    assert face_units.used_line(["jawOpen", "yaw"], ["b", "a"]) == "1 of 52 channels used; not known: a, b"
+    assert face_units.used_line(BLENDSHAPES, []) == "52 of 52 channels used"
 
 
 TURN = np.sin(np.arange(90) / 30)
@@ -68,8 +56,8 @@ def face_of(**channels):
     ],
 )
 def test_units_are_decided_by_what_a_head_can_do_in_a_file_and_live(motion, line):
-    times_s, live = np.arange(90) / 30, spaces.LiveUnits()
-    units = spaces.units_of(motion, times_s)
+    times_s, live = np.arange(90) / 30, face_units.LiveUnits()
+    units = face_units.units_of(motion, times_s)
     assert units.line == line
     taken = [live.take(row, time_s) for row, time_s in zip(motion, times_s, strict=True)]
     assert live.units == units and all(each is None for each in taken[:30])
@@ -79,7 +67,7 @@ def test_units_are_decided_by_what_a_head_can_do_in_a_file_and_live(motion, line
 
 def test_a_face_beyond_a_head_is_named():
     row = np.zeros(58)
-    assert spaces.beyond(row) is None
+    assert face_units.beyond(row) is None
     for name, value, line in [
         ("yaw", 20.0, "yaw: expected radians (in degrees?), got 20"),
         ("z", -600.0, "z: expected metres (in cm or mm?), got -600"),
@@ -88,4 +76,4 @@ def test_a_face_beyond_a_head_is_named():
     ]:
         wrong = row.copy()
         wrong[CHANNEL_INDEX[name]] = value
-        assert spaces.beyond(wrong) == line
+        assert face_units.beyond(wrong) == line

@@ -13,7 +13,7 @@ from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Fl
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.ports import Listener
 from sfms_robot.signals.audio import check_scale
-from sfms_robot.signals.spaces import beyond
+from sfms_robot.signals.face_units import beyond
 
 
 def load_listener(name: str | Path, engine: EngineName = "auto") -> LoadedListener:

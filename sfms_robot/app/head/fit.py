@@ -36,11 +36,11 @@ from sfms_robot.config.overlay import (
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.human import load_human
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats
+from sfms_robot.listeners.space import bounded_least_squares
 from sfms_robot.retarget.channel_mapping import Units
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.response_fit import Response, fit, fitted_drives, looks_like, rms
 from sfms_robot.runtime.safety import EASE_S
-from sfms_robot.signals.spaces import bounded_least_squares
 from sfms_robot.signals.tracks import Track, read_track, write_track
 
 FACE_FILES: Final = ("face.csv", "face.csv.gz")
