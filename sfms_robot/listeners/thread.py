@@ -214,7 +214,7 @@ class ListenerThread:
             "state": self._lateness.named(self._state),
             "restarts": 0,
             "skipped_frames": self._skipped,
-            "step_ms": self._step_ms.report(50, 99),
+            "step_ms": self._step_ms.report(p50=50, p99=99),
         }
 
     def close(self) -> None:

@@ -232,7 +232,7 @@ class RunLog:
             "target_hz": target_hz,
             "achieved_hz": round(self.ticks / elapsed_s, 2) if elapsed_s else None,
             "late": self.late if real else None,
-            "jitter_ms": late_ms.report(50, 99, 100),
+            "jitter_ms": late_ms.report(p50=50, p99=99, max=100),
         }
 
     def joint_report(self) -> dict[str, dict[str, float]]:

@@ -54,11 +54,11 @@ class Quantiles:
         middle = _LEAST * _RATIO ** (place - 0.5) if place else 0.0
         return min(middle, self._largest)
 
-    def report(self, *percents: int) -> dict[str, float | None]:
-        """{"p50": ..., "max": ...} to three digits after the point; every value None when nothing was taken."""
-        return {
-            "max" if each == 100 else f"p{each}": round(self.at(each), 3) if self._count else None for each in percents
-        }
+    def report(self, **percent: float) -> dict[str, float | None]:
+        """{"p50": ..., ...} to three digits after the point; every value None when nothing was taken."""
+        if not self._count:
+            return dict.fromkeys(percent)
+        return {name: round(self.at(each), 3) for name, each in percent.items()}
 
 
 def _bin(value: float) -> int:

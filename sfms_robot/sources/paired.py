@@ -125,11 +125,11 @@ class PairedSource:
             "frames": self._given,
             "overruns": self._overruns,
             "left_out": dict(self._judge.left_out),
-            "wait_ms": self._wait_ms.report(50, 99),
+            "wait_ms": self._wait_ms.report(p50=50, p99=99),
         }
         if self._sight is not None:
             figures["faces_lost"] = self._given - len(self._face_age_ms)
-            figures["face_age_ms"] = self._face_age_ms.report(50, 99)
+            figures["face_age_ms"] = self._face_age_ms.report(p50=50, p99=99)
         return figures | {name: dict(part.statistics()) for name, part in self._parts.items()}
 
     def close(self) -> None:

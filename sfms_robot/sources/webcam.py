@@ -339,7 +339,7 @@ class Webcam(LiveFace):
         return {
             **self._worker.statistics(),
             **self._counts,
-            "latency_ms": self._latency_ms.report(50, 99),
+            "latency_ms": self._latency_ms.report(p50=50, p99=99),
         }
 
     def close(self) -> None:

@@ -97,7 +97,7 @@ def test_a_log_of_hours_is_as_large_as_one_of_minutes():
     grown = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
     assert grown < 400_000  # a number kept for every tick would be 1.1 MB; a block may still be being counted
-    assert log.frame_to_wire_ms.report(50)["p50"] == pytest.approx(10.0, rel=0.02)
+    assert log.frame_to_wire_ms.report(p50=50)["p50"] == pytest.approx(10.0, rel=0.02)
 
 
 def test_the_share_of_attention_is_of_the_frames_that_tell_it():

@@ -32,7 +32,7 @@ def test_many_values_give_quantiles_within_a_percent(percent, seed):
 def test_the_largest_is_exact_zeros_stay_zeros_and_nothing_taken_is_none():
     quantiles = taken([*[0.0] * 10_000, 123.456])
     assert (quantiles.at(50), quantiles.at(100), len(quantiles)) == (0.0, 123.456, 10_001)
-    assert Quantiles().report(50) == {"p50": None}
+    assert Quantiles().report(p50=50) == {"p50": None}
     with pytest.raises(ValueError, match="no value"):
         Quantiles().at(50)
 
@@ -43,8 +43,8 @@ def test_any_thread_may_read_while_one_adds():
 
     def read():
         while not over.is_set():
-            told = quantiles.report(50, 100)
-            if told["p50"] is not None and not 0.0 <= told["p50"] <= told["max"]:
+            told = quantiles.report(p50=50, p100=100)
+            if told["p50"] is not None and not 0.0 <= told["p50"] <= told["p100"]:
                 wrong.append(told)
 
     reader = threading.Thread(target=read)

@@ -116,7 +116,7 @@ def idle_loop(duration_s: float) -> dict[str, Any]:
             if tick.time_s > duration_s:
                 break
             late_ms.add((tick.late_s + tick.skipped / _IDLE_HZ) * 1e3)
-    jitter_ms = late_ms.report(50, 99, 100)
+    jitter_ms = late_ms.report(p50=50, p99=99, max=100)
     busy = late_ms.at(99) > _BUSY_JITTER_MS or load() > (os.cpu_count() or 1) / 2
     return {"jitter_ms": jitter_ms, "busy": busy, "load": load(), "cores": os.cpu_count(), "priority": priority}
 
