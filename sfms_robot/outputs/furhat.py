@@ -76,7 +76,7 @@ class Furhat(WebSocketOutput):
         neutral = {"yaw": 0.0, "pitch": 0.0, "roll": 0.0, "relative": False, "speed": "slow"}
         self.say({"type": "request.face.headpose", **neutral})
         began_s = time.monotonic()
-        self.heard([each for each in self.link.until(began_s + self.neutral_s)], began_s)
+        self.heard(list(self.link.until(began_s + self.neutral_s)), began_s)
 
     def message(self, frame: OutputFrame, now_s: float) -> Message:
         return {"type": "request.face.params", "params": params_of(frame.motion)}

@@ -123,10 +123,10 @@ def read_track(path: Path | str) -> Track:
     low, high = face_bounds(_MOST_TURN_RAD)
     if outside := np.argwhere((motion < low) | (motion > high)).tolist():  # most likely in another unit
         row, place = outside[0]
-        column = columns[CHANNELS[place]].place
-        cell, unit = rows[row][column], "" if place > 5 else "; a name such as yaw_deg, x_cm has its unit"
+        at = columns[CHANNELS[place]].place
+        cell, unit = rows[row][at], "" if place > 5 else "; a name such as yaw_deg, x_cm has its unit"
         raise ConfigError(
-            f"{file}: row {row + 2}, column {header[column]}: expected {expected_unit(place)}, got {cell}{unit}"
+            f"{file}: row {row + 2}, column {header[at]}: expected {expected_unit(place)}, got {cell}{unit}"
         )
     if from_camera and np.isfinite(motion[:, 0]).any():
         motion[:, _PLACE] -= np.nanmedian(motion[:, _PLACE], axis=0)
