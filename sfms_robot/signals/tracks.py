@@ -252,8 +252,7 @@ class Take:
 
 def face_stretches(file: Path, name: str) -> list[Take]:
     """Return the stretches of a face track in which a face was seen. Raises ConfigError."""
-    motion = resample(read_track(file), FRAME_HZ).motion
-    return [Take(name, motion[first:end]) for first, end in runs(np.isfinite(motion).all(axis=1))]
+    return stretches(resample(read_track(file), FRAME_HZ).motion, name)
 
 
 def folder_takes(folder: Path) -> list[Take]:
@@ -265,3 +264,8 @@ def folder_takes(folder: Path) -> list[Take]:
     if not files:
         raise ConfigError(f"--data {str(folder)!r}: no face tracks (*.csv, *.csv.gz) below it")
     return [take for file in files for take in face_stretches(file, str(file.relative_to(folder)))]
+
+
+def stretches(motion: Floats, name: str) -> list[Take]:
+    """Return the parts of `motion` (N, 58) without gaps (rows that are not finite)."""
+    return [Take(name, motion[first:end]) for first, end in runs(np.isfinite(motion).all(axis=1))]
