@@ -349,9 +349,9 @@ class Ros2Node:
         try:
             self._received(topic, "/".join(str(sample.key_expr).split("/")[-2:]), sample.payload.to_bytes())
         except RobotError as error:
-            self.counts["refused"] += 1
             self._say(topic, str(error))
-        self.counts["received"] += 1  # once it has been taken
+            self.counts["refused"] += 1
+        self.counts["received"] += 1  # last: a message that is counted has been taken, or refused
 
     def _say(self, topic: str, reason: str) -> None:
         key = topic + re.sub(r"[\d.]+", "", reason)
