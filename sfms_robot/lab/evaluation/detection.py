@@ -21,7 +21,7 @@ from sfms_robot.lab.evaluation.intervals import rounded
 from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts
 from sfms_robot.signals import events
 from sfms_robot.signals.events import MOTION_EVENTS
-from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, directions, head_part
+from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYES_RAD, directions, head_part
 from sfms_robot.signals.motion_primitives import Motions
 
 _IN_TIME_S: Final = 0.12
@@ -120,7 +120,7 @@ def _pitch(motion: Floats) -> Doubles:
 
 def gaze_rad(motion: Floats) -> Doubles:
     """Return the direction (N, 2), yaw and pitch, in which head and eyes of motion (N, 58) look together."""
-    return np.asarray(motion[:, YAW_PITCH] + directions(motion, _EYES_RAD).mean(axis=1), float)
+    return np.asarray(motion[:, YAW_PITCH] + directions(motion, EYES_RAD).mean(axis=1), float)
 
 
 @dataclass(frozen=True)
