@@ -35,6 +35,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -89,30 +90,32 @@ class HeadTurn:
 
     def at(self, times_s: Doubles) -> Doubles:
         """Return angles (N, 2); before the turn those of its start."""
-        t = np.maximum(times_s - self.began_s, 0.0)[:, None]
-        off, slope, bend = self._lags()
-        return self.end_rad + (off + (slope + bend * t) * t) * np.exp(-self.rate * t)
+        return self.states(times_s)[:, 0]
 
-    def state_at(self, now_s: float) -> Doubles:
-        """Return angle, speed and acceleration (3, 2)."""
-        t = max(now_s - self.began_s, 0.0)
-        off, slope, bend = self._lags()
-        off, slope, bend = off + (slope + bend * t) * t, slope + 2 * bend * t, 2 * bend
-        faded = [off, slope - self.rate * off, bend - 2 * self.rate * slope + self.rate**2 * off]
-        state: Doubles = np.array(faded) * math.exp(-self.rate * t)
-        state[0] += self.end_rad
-        return state
+    def states(self, times_s: Doubles) -> Doubles:
+        """Return angle, speed and acceleration (N, 3, 2)."""
+        t = np.maximum(times_s - self.began_s, 0.0)[:, None, None]
+        off, slope, bend = self._off
+        out: Doubles = (off + (slope + bend * t) * t) * np.exp(-self.rate * t)
+        out[:, 0] += self.end_rad
+        return out
 
-    def _lags(self) -> tuple[Doubles, Doubles, Doubles]:
-        """Return the constants (2,) of the way to the end, (off + slope t + bend t^2) exp(-rate t), a triple pole."""
-        angle, speed, acceleration = self.start
-        off = angle - self.end_rad
-        slope = speed + self.rate * off
-        return off, slope, 0.5 * (acceleration + 2 * self.rate * speed + self.rate**2 * off)
+    @cached_property
+    def _off(self) -> tuple[Doubles, Doubles, Doubles]:
+        """Constants (3, 2) of the way to the end, exp(A t) (start - end) = (off + slope t + bend t^2) exp(-rate t).
+
+        All poles of A lie at -rate, so the cube of A + rate is 0.
+        """
+        rate = self.rate
+        nilpotent = np.array([[rate, 1.0, 0.0], [0.0, rate, 1.0], [-(rate**3), -3.0 * rate**2, -2.0 * rate]])
+        off = self.start.copy()
+        off[0] -= self.end_rad
+        slope = nilpotent @ off
+        return off, slope, 0.5 * (nilpotent @ slope)
 
     def to(self, end_rad: Doubles, now_s: float, rate: float) -> HeadTurn:
         """Return the turn to another end from now on."""
-        return HeadTurn(self.state_at(now_s), end_rad, now_s, rate)
+        return HeadTurn(self.states(np.array([now_s]))[0], end_rad, now_s, rate)
 
 
 @dataclass(frozen=True)
@@ -280,22 +283,17 @@ class GazeTarget:
         over = latest_s - state.gaze.end_s >= max(PAUSE_S, latest_s - earliest_s)
         if over and not np.array_equal(gaze_rad, state.gaze.end_rad):
             state = replace(state, gaze=Jump.between(state.gaze.end_rad, gaze_rad, latest_s))
-        head_rad = self._head_of(person_rad, state.aside_rad, gone)
+        if not self._neck:
+            head_rad = np.zeros(2)
+        elif self._eyeless:
+            head_rad = person_rad + (1.0 if gone else EYELESS_AWAY) * state.aside_rad * [1.0, 0.0]
+        else:
+            left_rad = gaze_rad - self._share * (gaze_rad if gone else person_rad)
+            head_rad = gaze_rad - np.clip(left_rad, -EYES_KEEP_RAD, EYES_KEEP_RAD)
         if earliest_s >= state.head.began_s and not np.array_equal(head_rad, state.head.end_rad):
             turn = state.head.to(head_rad, latest_s, SLOW_HEAD_RATE if gone else HEAD_RATE)
             state = replace(state, head=turn, head_before=state.head)
         return state
-
-    def _head_of(self, person_rad: Doubles, aside_rad: Doubles, gone: bool) -> Doubles:
-        """Return the neck's part of these directions."""
-        if not self._neck:
-            return np.zeros(2)
-        if self._eyeless:
-            return person_rad + (1.0 if gone else EYELESS_AWAY) * aside_rad * [1.0, 0.0]
-        wanted_rad = person_rad + aside_rad
-        head_rad = self._share * (wanted_rad if gone else person_rad)
-        kept_rad: Doubles = np.clip(wanted_rad - head_rad, -EYES_KEEP_RAD, EYES_KEEP_RAD)
-        return wanted_rad - kept_rad
 
 
 # --- Holding ----------------------------------------------------------------------------------------------------------

@@ -17,14 +17,14 @@ import numpy as np
 
 from sfms_robot.config.kinematics import SerialNeck, Split
 from sfms_robot.frames import Bools, Doubles
+from sfms_robot.ranges import Range
 from sfms_robot.signals import rotations
 
 EXACT_RAD: Final = 1e-9
 EXACT_M: Final = 1e-9
 _POSE_ORDER: Final = (2, 1, 0)  # R = Rz(yaw) Ry(pitch) Rx(roll)
 
-Range = tuple[float, float]  # min, max [rad]
-Ranges = Mapping[str, Range]
+Ranges = Mapping[str, tuple[float, float]]  # min, max [rad] by joint
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,19 +32,28 @@ class Solved:
     """Joints for one pose or many.
 
     Attributes:
+        wanted: (..., 6) the requested pose.
         angles_rad: (..., J) in the neck's joint order, always inside the joints' ranges.
         reached: (...) True if these joints give the requested pose.
-        residual_rad: (...) the turn that is missing.
-        residual_m: (...) the shift that is missing.
         shown: (..., 6) the pose that these joints give, always finite; a turn that is reached is equal to the requested
             one, to the bit.
     """
 
+    wanted: Doubles
     angles_rad: Doubles
     reached: Bools
-    residual_rad: Doubles
-    residual_m: Doubles
     shown: Doubles
+
+    @property
+    def residual_rad(self) -> Doubles:
+        """The turn (...) that is missing."""
+        turns = [rotations.rotation(pose[..., :3]) for pose in (self.wanted, self.shown)]
+        return rotations.angle_between(*turns)
+
+    @property
+    def residual_m(self) -> Doubles:
+        """The shift (...) that is missing."""
+        return np.asarray(np.linalg.norm(self.wanted[..., 3:] - self.shown[..., 3:], axis=-1))
 
 
 def low_pass(angle_rad: float, before_rad: float, cutoff_hz: float, dt_s: float) -> float:
@@ -76,17 +85,26 @@ class Serial:
     def __init__(self, config: SerialNeck, ranges: Ranges) -> None:
         self.joints: Sequence[str] = config.joints()
         self.axes: Sequence[str] = config.order
-        self._config = config
-        self._ranges = {name: ranges[name] for name in self.joints}
-        self._column = {name: column for column, name in enumerate(self.joints)}
         self._axes = tuple(rotations.AXIS[name] for name in config.order)
-        places = [config.axes.get(name) for name in config.order]
-        self._places: Sequence[str | Split | None] = places  # per axis its joint, or two; None: the differential's
-        single = [(column, place) for column, place in enumerate(places) if isinstance(place, str)]
-        self._single_axes = np.array([column for column, _ in single], dtype=np.intp)
-        self._single_joints = np.array([self._column[name] for _, name in single], dtype=np.intp)
-        self._single_low, self._single_high = np.array([ranges[name] for _, name in single]).reshape(-1, 2).T
-        self._splits = [(column, place) for column, place in enumerate(places) if isinstance(place, Split)]
+        self._range = Range(*np.array([ranges[name] for name in self.joints]).T)
+        column = {name: column for column, name in enumerate(self.joints)}
+        self._splits: list[tuple[int, Split, Range, list[int]]] = []  # row of the axis, range and columns of its joints
+        # Angles of the axes (..., k) @ goals = those of the joints (..., J), without their limits; and the reverse.
+        goals = np.zeros((len(self._axes), len(self.joints)))
+        for row, place in enumerate(map(config.axes.get, config.order)):
+            if isinstance(place, str):
+                goals[row, column[place]] = 1.0
+            elif place is not None:
+                both = [column[place.lower], column[place.upper]]
+                goals[row, both] = 0.5
+                self._splits.append((row, place, Range(self._range.low[both], self._range.high[both]), both))
+        self._pair: list[int] = []  # columns of the differential's joints
+        if (pair := config.differential) is not None:
+            self._pair = [column[pair.left], column[pair.right]]
+            self._pair_range = Range(self._range.low[self._pair], self._range.high[self._pair])
+            goals[config.order.index("pitch"), self._pair] = pair.pitch_gain
+            goals[config.order.index("roll"), self._pair] = pair.roll_gain, -pair.roll_gain
+        self._goals, self._turns = goals, np.linalg.pinv(goals)
 
     def solve(self, poses: Doubles, body_yaw_rad: Doubles | None = None) -> Solved:
         """Solve poses (..., 6), each held for ever. Without `body_yaw_rad` (...) the neck's own rule turns the body.
@@ -99,12 +117,10 @@ class Serial:
         angles = self._axis_angles(poses)
         joints = self._joint_angles(angles, angles)
         rotation, shown = self._rotation(joints), np.zeros_like(poses)
-        missing_rad = rotations.angle_between(rotations.rotation(poses[..., :3]), rotation)
-        missing_m = np.asarray(np.linalg.norm(poses[..., 3:], axis=-1))
-        exact = np.asarray(missing_rad <= EXACT_RAD)
+        exact = rotations.angle_between(rotations.rotation(poses[..., :3]), rotation) <= EXACT_RAD
         shown[..., :3] = np.where(exact[..., None], poses[..., :3], rotations.angles_of(rotation))
-        reached = np.asarray(exact & (missing_m <= EXACT_M))
-        return Solved(angles_rad=joints, reached=reached, residual_rad=missing_rad, residual_m=missing_m, shown=shown)
+        reached = np.asarray(exact & (np.linalg.norm(poses[..., 3:], axis=-1) <= EXACT_M))
+        return Solved(wanted=poses, angles_rad=joints, reached=reached, shown=shown)
 
     def start(self) -> Doubles:
         """Return the memory of a neck that stands at home."""
@@ -114,9 +130,9 @@ class Serial:
         """Return the joints (J,) for one pose (6,) after `dt_s`, and the memory after it."""
         wanted = checked(pose)
         angles, slow = self._axis_angles(wanted), memory.copy()
-        for column, place in self._splits:
+        for row, place, *_ in self._splits:
             if place.crossover_hz is not None:
-                slow[column] = low_pass(angles[column], memory[column], place.crossover_hz, dt_s)
+                slow[row] = low_pass(angles[row], memory[row], place.crossover_hz, dt_s)
         return self._joint_angles(angles, slow), slow
 
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
@@ -138,60 +154,37 @@ class Serial:
 
     def _joint_angles(self, angles: Doubles, slow: Doubles) -> Doubles:
         """Return joints (..., J) inside their ranges for axis angles and their low-passed ones (..., k)."""
-        out = np.zeros((*angles.shape[:-1], len(self.joints)))
-        alone = np.minimum(np.maximum(angles[..., self._single_axes], self._single_low), self._single_high)
-        out[..., self._single_joints] = alone
-        for column, place in self._splits:
-            angle = angles[..., column]
-            low = slow[..., column] if place.lower_share is None else place.lower_share * angle
-            parts = shared(angle, low, self._ranges[place.lower], self._ranges[place.upper])
-            for joint, part in zip((place.lower, place.upper), parts, strict=True):
-                out[..., self._column[joint]] = part
-        if (pair := self._config.differential) is not None:  # left, right = pitch_gain pitch +- roll_gain roll
-            order = self._config.order
-            pitch = pair.pitch_gain * angles[..., order.index("pitch")]
-            roll = pair.roll_gain * angles[..., order.index("roll")]
-            low, high = np.array([self._ranges[pair.left], self._ranges[pair.right]]).T
-            columns = [self._column[pair.left], self._column[pair.right]]
-            out[..., columns] = shrunk(np.stack([pitch + roll, pitch - roll], axis=-1), low, high)
-        return out
+        out: Doubles = angles @ self._goals
+        for row, place, ends, (below, above) in self._splits:
+            angle = angles[..., row]
+            lower = slow[..., row] if place.lower_share is None else place.lower_share * angle
+            out[..., below], out[..., above] = shared(angle, lower, ends)
+        if self._pair:
+            out[..., self._pair] = shrunk(out[..., self._pair], self._pair_range)
+        return self._range.nearest(out)
 
     def _rotation(self, joints: Doubles) -> Doubles:
         """Return R (..., 3, 3) of joints (..., J)."""
-        turns = []
-        for name, axis, place in zip(self._config.order, self._axes, self._places, strict=True):
-            if isinstance(place, str):
-                angle = joints[..., self._column[place]]
-            elif place is not None:
-                angle = joints[..., self._column[place.lower]] + joints[..., self._column[place.upper]]
-            else:
-                pair = self._config.differential
-                assert pair is not None  # an axis without a joint has the differential
-                left, right = joints[..., self._column[pair.left]], joints[..., self._column[pair.right]]
-                pitches = name == "pitch"
-                angle = (left + right) / (2 * pair.pitch_gain) if pitches else (left - right) / (2 * pair.roll_gain)
-            turns.append(rotations.about(axis, angle))
-        return reduce(np.matmul, turns)
+        angles = joints @ self._turns
+        return reduce(np.matmul, [rotations.about(axis, angles[..., row]) for row, axis in enumerate(self._axes)])
 
 
-def shared(total_rad: Doubles, lower_rad: Doubles, lower: Range, upper: Range) -> tuple[Doubles, Doubles]:
-    """Return both joints' angles inside their ranges, from the total (...) and the lower joint's part (...).
+def shared(total_rad: Doubles, lower_rad: Doubles, ends: Range) -> tuple[Doubles, Doubles]:
+    """Return both joints' angles inside their ranges (2,), from the total (...) and the lower joint's part (...).
 
     The part beyond the range of one joint goes to the other, so the sum is the total wherever both together can.
     """
-    below = np.clip(lower_rad, *lower)
-    above = np.clip(total_rad - below, *upper)
-    return np.clip(total_rad - above, *lower), above
+    (lowest, least), (highest, most) = ends.low, ends.high
+    above = np.clip(total_rad - np.clip(lower_rad, lowest, highest), least, most)
+    return np.clip(total_rad - above, lowest, highest), above
 
 
-def shrunk(servos_rad: Doubles, low_rad: Doubles, high_rad: Doubles) -> Doubles:
+def shrunk(servos_rad: Doubles, ends: Range) -> Doubles:
     """Return both servos (..., 2) shrunk by one factor until both are in range (2,), which holds 0.
 
     One factor keeps the ratio of pitch and roll, where clipping each servo would turn a nod into a tilt.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        over = np.where(servos_rad > high_rad, high_rad / servos_rad, 1.0)
-        under = np.where(servos_rad < low_rad, low_rad / servos_rad, 1.0)
-    factor = np.minimum(over, under).min(axis=-1, keepdims=True)
-    scaled_rad: Doubles = np.clip(servos_rad * factor, low_rad, high_rad)
-    return scaled_rad
+        over = np.where(servos_rad > ends.high, ends.high / servos_rad, 1.0)
+        under = np.where(servos_rad < ends.low, ends.low / servos_rad, 1.0)
+    return ends.nearest(servos_rad * np.minimum(over, under).min(axis=-1, keepdims=True))

@@ -227,17 +227,9 @@ class Stewart:
         angles = cranks.reshape(*shape, 6)
         if self.turns_body:
             angles = np.concatenate([np.broadcast_to(body, shape)[..., None], angles], axis=-1)
-        missing_rad = rotations.angle_between(rotations.rotation(wanted[:, :3]), rotations.rotation(given[:, :3]))
-        missing_m = np.asarray(np.linalg.norm(wanted[:, 3:] - given[:, 3:], axis=-1))
         reached = reached.reshape(shape)
         shown = np.where(reached[..., None], poses, rotations.seen_from(-body, given.reshape(poses.shape)))
-        return Solved(
-            angles_rad=angles,
-            reached=reached,
-            residual_rad=missing_rad.reshape(shape),
-            residual_m=missing_m.reshape(shape),
-            shown=shown,
-        )
+        return Solved(wanted=poses, angles_rad=angles, reached=reached, shown=shown)
 
     def nearest(self, poses: Doubles) -> tuple[Doubles, Bools]:
         """Return the nearest poses (n, 6) that can be reached, straight back toward home, and which were reached (n,).
