@@ -26,6 +26,7 @@ from sfms_robot.config import Expression, Head
 from sfms_robot.config.head import drives
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Bools, Doubles, Floats, Indices
+from sfms_robot.ranges import Range
 
 Tree = tuple[int, Expression]  # joint, node
 
@@ -92,8 +93,8 @@ class ChannelMapping:
         self.joints: Sequence[str] = tuple(head.joints)
         self._regions = head.regions
         self._units = Units.of(head)
-        self._low_rad = np.array([joint.min_rad for joint in head.joints.values()])
-        self._high_rad = np.array([joint.max_rad for joint in head.joints.values()])
+        ends = np.array([(joint.min_rad, joint.max_rad) for joint in head.joints.values()])
+        self._range = Range(*ends.reshape(-1, 2).T)
 
         trees = drives(head)
         self._program = Program.of(list(trees.values()))
@@ -139,10 +140,7 @@ class ChannelMapping:
             values = self._inside(self._turned(values, knobs))
         if self._moving:
             self._couple(values)
-        angles = self._units.angles(values)
-        np.maximum(angles, self._low_rad, out=angles)
-        np.minimum(angles, self._high_rad, out=angles)
-        return angles
+        return self._range.nearest(self._units.angles(values))
 
     def _couple(self, values: Doubles) -> None:
         """Change values (..., J) in place until the coupled sums are met, as far as the ranges allow."""
@@ -210,45 +208,41 @@ class _Curves:
         x = values[..., self.where]
         piece = (x[..., None] >= self.breaks).sum(axis=-1)
         rows = np.arange(len(self.where))
-        c = self.pieces[rows, piece]
-        flat = (piece == 0) | np.isinf(self.breaks[rows, np.minimum(piece, self.breaks.shape[1] - 1)])
-        t = np.where(flat, 0.0, x - self.origins[rows, piece])  # outside, x may be too large to be cubed
-        t[piece == self.breaks.shape[1]] = 0.0
+        c, t = self.pieces[rows, piece], x - self.origins[rows, piece]
         values[..., self.where] = ((c[..., 0] * t + c[..., 1]) * t + c[..., 2]) * t + c[..., 3]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _Shape:
-    """Operations on the values (..., n) of a level's nodes; None for one that no node has, to save time in a tick."""
+    """Operations on the values (..., n) of a level's nodes, without those that change none, to save time in a tick.
+
+    Attributes:
+        gains: (2, n) factors below and above 0, where they differ; else the factor is among the steps.
+        steps: in this order factor, offset, low and high end.
+    """
 
     dead_band: Doubles | None
     curves: _Curves | None
-    gain_up: Doubles | None
-    gain_down: Doubles | None
-    offset: Doubles | None
-    low: Doubles | None
-    high: Doubles | None
+    gains: Doubles | None
+    steps: tuple[tuple[np.ufunc, Doubles], ...]
 
     @classmethod
     def of(cls, nodes: Sequence[Expression]) -> _Shape:
         count = np.array([float(len(node.mean or (1,))) for node in nodes])  # a mean is a sum, until it is scaled
         dead = np.array([node.dead_band for node in nodes]) * count
-        gains = np.array([node.gains for node in nodes]).reshape(-1, 2)
-        gains /= np.where([node.curve is None for node in nodes], count, 1.0)[:, None]
-        gained = bool((gains != 1).any())
-        offset = np.array([node.offset for node in nodes])
+        gains = np.array([node.gains for node in nodes]).reshape(-1, 2).T
+        gains /= np.where([node.curve is None for node in nodes], count, 1.0)
+        even = bool((gains[0] == gains[1]).all())
         limit = [_PRODUCT_LIMIT if node.product else np.inf for node in nodes]
         ends = [node.clamp or (-top, top) for node, top in zip(nodes, limit, strict=True)]
         low, high = np.array(ends).reshape(-1, 2).T
-        clamped = bool(np.isfinite(low).any())
+        operands = [gains[1] if even else 1.0, np.array([node.offset for node in nodes]), low, high]
+        steps = zip((np.multiply, np.add, np.maximum, np.minimum), operands, (1.0, 0.0, -np.inf, np.inf), strict=True)
         return cls(
-            dead_band=dead if dead.any() else None,
-            curves=_Curves.of([node.curve for node in nodes], count),
-            gain_up=gains[:, 1] if gained else None,
-            gain_down=gains[:, 0] if (gains[:, 0] != gains[:, 1]).any() else None,
-            offset=offset if offset.any() else None,
-            low=low if clamped else None,
-            high=high if clamped else None,
+            dead if dead.any() else None,
+            _Curves.of([node.curve for node in nodes], count),
+            None if even else gains,
+            tuple((step, np.asarray(operand)) for step, operand, idle in steps if np.any(operand != idle)),
         )
 
     def __call__(self, values: Doubles) -> Doubles:
@@ -257,13 +251,10 @@ class _Shape:
             values -= np.minimum(np.maximum(values, -self.dead_band), self.dead_band)
         if self.curves is not None:
             self.curves.into(values)
-        if self.gain_up is not None:
-            values *= self.gain_up if self.gain_down is None else np.where(values > 0, self.gain_up, self.gain_down)
-        if self.offset is not None:
-            values += self.offset
-        if self.low is not None and self.high is not None:
-            np.maximum(values, self.low, out=values)
-            np.minimum(values, self.high, out=values)
+        if self.gains is not None:
+            values *= np.where(values > 0, self.gains[1], self.gains[0])
+        for step, operand in self.steps:
+            step(values, operand, out=values)
         return values
 
 
@@ -343,19 +334,22 @@ def merged(node: Expression) -> Expression:
     parts = [merged(part) for part in node.parts]
     if node.sum is not None:
         parts = [term for part in parts for term in (_terms(part) or (part,))]
-    node = node.model_copy(update={node.group: tuple(parts)})
+    node = node.replaced(**{node.group: tuple(parts)})
     inner = parts[0]
-    linear = not node.dead_band and node.curve is None and node.gains[0] == node.gains[1]
-    if len(parts) > 1 or not linear or (node.clamp and inner.clamp):
+    if len(parts) > 1 or not _is_linear(node) or (node.clamp and inner.clamp):
         return node
     scaled = _scaled(inner, node.gains[0], node.offset)
-    return scaled.model_copy(update={"clamp": node.clamp}) if node.clamp else scaled
+    return scaled.replaced(clamp=node.clamp) if node.clamp else scaled
+
+
+def _is_linear(node: Expression) -> bool:
+    """Return whether a node is a factor and an offset, before its clamp."""
+    return not node.dead_band and node.curve is None and node.gains[0] == node.gains[1]
 
 
 def _terms(part: Expression) -> tuple[Expression, ...]:
     """Return the terms of a sum that a sum around it can take over; none where it cannot."""
-    plain = not part.dead_band and part.curve is None and part.clamp is None and part.gains[0] == part.gains[1]
-    if part.sum is None or not plain:
+    if part.sum is None or part.clamp is not None or not _is_linear(part):
         return ()
     gain = part.gains[0]
     return tuple(_scaled(term, gain, part.offset if i == 0 else 0.0) for i, term in enumerate(part.sum))
@@ -368,5 +362,4 @@ def _scaled(node: Expression, gain: float, offset: float) -> Expression:
     if node.clamp is not None:
         low, high = sorted(gain * end + offset for end in node.clamp)
         clamp = (low, high)
-    change = {"gain_up": gain * up, "gain_down": gain * down, "offset": gain * node.offset + offset, "clamp": clamp}
-    return node.model_copy(update=change)
+    return node.replaced(gain_up=gain * up, gain_down=gain * down, offset=gain * node.offset + offset, clamp=clamp)

@@ -37,7 +37,7 @@ _PLAIN: Final = 0.002  # price of a slope other than 1: decides where there is n
 
 def looks_like(head: Head, shapes: Floats | Doubles) -> Doubles:
     """Return the joint values (N, J) that explain blendshapes (N, 52) of the robot's own face."""
-    return asked(head.model_copy(update={"couplings": ()}), shapes)
+    return asked(head.replaced(couplings=()), shapes)
 
 
 def asked(head: Head, shapes: Floats | Doubles) -> Doubles:
@@ -92,7 +92,13 @@ def _response(has: Doubles, looks: Doubles, low: float, high: float) -> Response
     below = low * spread[::-1] if low < 0 else np.zeros(1)
     above = high * spread[1:] if high > 0 else np.zeros(0)
     knots = np.concatenate([below, above])
-    x, y, weight = _binned(has, looks, low, high)
+    # One point per bin, so that long rest does not dominate: mean of `has`, median of `looks`, weight.
+    bins = np.clip(((has - low) / (high - low) * _BINS).astype(int), 0, _BINS - 1)
+    _, bins, count = np.unique(bins, return_inverse=True, return_counts=True)
+    x = np.bincount(bins, has) / count
+    y = np.array([np.median(looks[bins == each]) for each in range(len(count))])
+    weight = np.sqrt(np.minimum(count, _FULL_WEIGHT) / _FULL_WEIGHT)
+    weight /= np.sqrt((weight**2).mean() * len(weight))
     width = np.diff(knots)
     parts = np.clip((x[:, None] - knots[:-1]) / width, 0.0, 1.0) - (knots[:-1] < 0)  # 0 at rest, of either side
     # Unknowns are the slope of each piece, then the offset.
@@ -106,16 +112,6 @@ def _response(has: Doubles, looks: Doubles, low: float, high: float) -> Response
     heights = np.concatenate([[0.0], np.cumsum(found[:-1] * width)])
     heights -= heights[len(below) - 1]  # 0 at rest
     return Response(knots, heights, float(found[-1]), moved)
-
-
-def _binned(has: Doubles, looks: Doubles, low: float, high: float) -> tuple[Doubles, Doubles, Doubles]:
-    """Return mean of `has`, median of `looks` and weight per bin, so that long rest does not dominate."""
-    bins = np.clip(((has - low) / (high - low) * _BINS).astype(int), 0, _BINS - 1)
-    _, bins, count = np.unique(bins, return_inverse=True, return_counts=True)
-    x = np.bincount(bins, has) / count
-    y = np.array([np.median(looks[bins == each]) for each in range(len(count))])
-    weight = np.sqrt(np.minimum(count, _FULL_WEIGHT) / _FULL_WEIGHT)
-    return x, y, weight / np.sqrt((weight**2).mean() * len(weight))
 
 
 def rms(errors: Doubles) -> float:
