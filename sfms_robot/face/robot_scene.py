@@ -54,7 +54,7 @@ class RobotScene:
 
     Attributes:
         urdf: the file. generic: it is made of the joints of a head that has none.
-        text: what the page shows in place of the file, None where that is the file itself.
+        text: what the page shows: the file, where nothing is left out.
         robot: what it holds, without the visuals of `left_out`.
         meshes: file name of a mesh as the URDF has it -> the file, links followed; empty for primitive shapes.
         left_out: one line for each part that is not drawn, or probably not meant so.
@@ -63,18 +63,15 @@ class RobotScene:
         undriven: joints of the head that move nothing in the picture.
     """
 
-    def __init__(
-        self,
-        head: Head,
-        urdf: Path,
-        neck: ForwardNeck | None = None,
-        packages: Sequence[str] = (),
-        text: bytes | None = None,
-    ) -> None:
-        """Read a URDF. Raises ConfigError of one line: it is broken, or a joint that is named for it is not in it."""
+    def __init__(self, head: Head, file: Path | None, neck: ForwardNeck | None, packages: Sequence[str]) -> None:
+        """Read a URDF; `file` None: make a generic one. See `of`.
+
+        Raises ConfigError of one line: it is broken, or a joint that is named for it is not in it.
+        """
         description = head.urdf or RobotDescription(file=URDF_FILE)
-        self.urdf, self.generic, self.robot = urdf, text is not None, read_urdf(urdf, text)
-        self.text = text or self.robot.text
+        text, urdf = (generic_urdf(head), Path("generic.urdf")) if file is None else (None, file)
+        self.urdf, self.generic, self.robot = urdf, file is None, read_urdf(urdf, text)
+        self.text = self.robot.text
         self.meshes: dict[str, Path] = {}
         self.left_out = list(self.robot.left_out)
         self._find_meshes(head.folder or Path(), description.packages, packages)
@@ -106,10 +103,7 @@ class RobotScene:
             neck: the head's forward kinematics, for a platform or a differential.
             packages: folders outside the head's that meshes may come from.
         """
-        file = urdf_file(head)
-        if file is None:
-            return cls(head, Path("generic.urdf"), neck, packages, generic_urdf(head))
-        return cls(head, file, neck, packages)
+        return cls(head, urdf_file(head), neck, packages)
 
     def _find_meshes(self, own: Path, named: Mapping[str, str], folders: Sequence[str]) -> None:
         """Fill `meshes` and `left_out`. `own`: the head's folder; `named`: folders of packages, from there on."""

@@ -90,7 +90,7 @@ class Urdf:
     Attributes:
         joints: by name, parents before children.
         left_out: one line for each visual or colour that is not drawn, and for angles that look like degrees.
-        text: the file without what is left out and without a namespace, where it had one of these; else None.
+        text: the file; without what is left out and without a namespace, where it had one of these.
     """
 
     name: str
@@ -98,7 +98,7 @@ class Urdf:
     joints: Mapping[str, JointElement]
     visuals: tuple[Visual, ...]
     left_out: tuple[str, ...]
-    text: bytes | None
+    text: bytes
 
     def link_places(self, values: Mapping[str, float]) -> dict[str, Doubles]:
         """Return every link's place (4, 4) in the root's axes, for joint values [rad, m]; 0 where none is given."""
@@ -141,7 +141,7 @@ def read_urdf(file: Path, text: bytes | None = None) -> Urdf:
         raise ConfigError(f"{file}: not a URDF: its first element is <{tag}>, not <robot>")
     for element in root.iter() if space else ():
         element.tag = element.tag.removeprefix(f"{space}}}")
-    return _UrdfReader(file, root, bool(space)).robot()
+    return _UrdfReader(file, root, None if space else data).robot()
 
 
 def _unresolved(root: Element, spaces: Collection[str]) -> list[str]:
@@ -157,9 +157,9 @@ def _unresolved(root: Element, spaces: Collection[str]) -> list[str]:
 class _UrdfReader:
     """A reader of one file, whose errors name the file and the element."""
 
-    def __init__(self, file: Path, root: Element, changed: bool) -> None:
-        """`changed`: the elements differ from the file's already."""
-        self._file, self._root, self._changed = file, root, changed
+    def __init__(self, file: Path, root: Element, text: bytes | None) -> None:
+        """`text`: of these elements; None where they differ from the file's already."""
+        self._file, self._root, self._text = file, root, text
         self._left_out: list[str] = []
         self._degrees: dict[str, str] = {}  # element with angles beyond a turn -> its angles
         self._colors: dict[str, Color] = {}
@@ -176,7 +176,7 @@ class _UrdfReader:
         except ConfigError as error:
             parent.remove(element)
             self._left_out.append(f"{error}: {then}")
-            self._changed = True
+            self._text = None
 
     def robot(self) -> Urdf:
         links = [self._name(link) for link in self._root.findall("link")]
@@ -208,7 +208,7 @@ class _UrdfReader:
             joints=ordered,
             visuals=tuple(visuals),
             left_out=tuple(self._left_out),
-            text=ElementTree.tostring(self._root) if self._changed else None,
+            text=self._text or ElementTree.tostring(self._root),
         )
 
     def _joint(self, element: Element, links: list[str]) -> JointElement:

@@ -208,15 +208,15 @@ class PageServer:
 
     Args:
         send: sends the run, without waiting, a document or a piece of sound of a visitor (see `page_process`).
-        token, now: see `Visitors`.
+        token: see `Visitors`.
 
     Attributes:
         app: for an ASGI server.
     """
 
-    def __init__(self, send: Send, token: str | None, now: Callable[[], float] = time.monotonic) -> None:
-        self._send_run, self._token, self._now = send, token, now
-        self._visitors = Visitors(token, lambda number: send(number, {"left": True}), now)
+    def __init__(self, send: Send, token: str | None) -> None:
+        self._send_run, self._token = send, token
+        self._visitors = Visitors(token, lambda number: send(number, {"left": True}), time.monotonic)
         self._hello: dict[str, Any] = {}
         self._began = asyncio.Event()  # there is a hello
         self._new_scene: NewScene = lambda: None
@@ -328,10 +328,8 @@ class PageServer:
         scene, file = self._scene, request.path_params["file"]
         if scene is None:
             return PlainTextResponse("no run has begun\n", 404)
-        if file == Path(URDF).name and scene.text is not None:
-            return Response(scene.text, media_type="application/xml")
         if file == Path(URDF).name:
-            return FileResponse(scene.urdf, media_type="application/xml")
+            return Response(scene.text, media_type="application/xml")
         meshes = {name.removeprefix("package://").removeprefix("./"): mesh for name, mesh in scene.meshes.items()}
         return FileResponse(meshes[file]) if file in meshes else PlainTextResponse(f"no mesh {file}\n", 404)
 
@@ -384,7 +382,7 @@ class PageServer:
                     return
                 visitor.tell(message_json(type="error", error=str(error)))
             cost_s = COMMAND_S if text is not None else PERSON_S + len(data) / PERSON_BYTES_PER_S
-            if pause_s := visitor.pause_s(cost_s, self._now()):
+            if pause_s := visitor.pause_s(cost_s, time.monotonic()):
                 await asyncio.sleep(pause_s)
 
     def _command(self, visitor: Visitor, name: str, values: dict[str, Any]) -> None:

@@ -128,7 +128,7 @@ def test_a_head_without_a_urdf_is_drawn_from_its_joints(name):
     unnamed = head.model_copy(update={"name": "unnamed", "urdf": None})
     neck = build_neck(head.kinematics, head.joints) if head.kinematics else None
     scene = RobotScene.of(unnamed, neck)
-    assert scene.text is not None and not scene.undriven
+    assert scene.generic and not scene.undriven
     at_rest = scene.robot.link_places(dict(zip(scene.joints, scene.rest(), strict=True)))
     moved = scene.values(np.array([joint.rest_rad + 0.05 for joint in head.joints.values()]))
     places = scene.robot.link_places(dict(zip(scene.joints, moved, strict=True)))
