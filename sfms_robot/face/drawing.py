@@ -73,11 +73,18 @@ def add_renderer(vtk: Any, window: Any, box: tuple[float, float, float, float], 
 
 
 def add_head(vtk: Any, renderer: Any, head: HumanHead, motion: Floats) -> None:
-    """Add the head at one instant, and three lights."""
-    skin = _mesh_actor(vtk, head.vertices(motion), head.triangles)
-    skin.mapper.input.point_data.SetScalars(vtk.arrays.numpy_to_vtk(head.colors, deep=True))
-    skin.property.specular, skin.property.specular_power = 0.12, 18
-    renderer.AddActor(skin)
+    """Add the head at one instant, smoothly shaded, and three lights."""
+    points, cells = vtk.Points(), vtk.CellArray()
+    points.SetData(vtk.arrays.numpy_to_vtk(head.vertices(motion), deep=True))
+    starts = np.arange(0, head.triangles.size + 1, 3, dtype=np.int64)
+    cells.SetData(*(vtk.arrays.numpy_to_vtkIdTypeArray(each, deep=True) for each in (starts, head.triangles.ravel())))
+    mesh = vtk.PolyData(points=points, polys=cells)
+    mesh.point_data.SetScalars(vtk.arrays.numpy_to_vtk(head.colors, deep=True))
+    normals = vtk.PolyDataNormals(input_data=mesh, splitting=False, consistency=False)
+    normals.Update()
+    style = vtk.Property(specular=0.12, specular_power=18)
+    style.SetInterpolationToPhong()
+    renderer.AddActor(vtk.Actor(mapper=vtk.PolyDataMapper(input_data=normals.GetOutput()), property=style))
     for place, strength in (((1.3, 0.6, 0.8), 0.80), ((1.0, -1.2, 0.1), 0.36), ((0.1, 1.3, 0.9), 0.26)):
         add_light(vtk, renderer, place, (0, 0, 0), strength)
 
@@ -104,24 +111,6 @@ def look(renderer: Any, from_m: Point, to_m: Point, angle_deg: float) -> None:
     camera.view_angle, camera.view_up = angle_deg, (0, 0, 1)
     camera.focal_point, camera.position = tuple(to_m), tuple(from_m)
     renderer.ResetCameraClippingRange()
-
-
-def _mesh_actor(vtk: Any, vertices: Floats | Doubles, triangles: NDArray[np.int64]) -> Any:
-    """Return a smooth-shaded mesh: vertices (V, 3), triangles (T, 3)."""
-    points, cells = vtk.Points(), vtk.CellArray()
-    points.SetData(vtk.arrays.numpy_to_vtk(np.ascontiguousarray(vertices, dtype=np.float32), deep=True))
-    corners = np.ascontiguousarray(triangles, dtype=np.int64).ravel()
-    starts = np.arange(0, len(corners) + 1, 3, dtype=np.int64)
-    cells.SetData(
-        vtk.arrays.numpy_to_vtkIdTypeArray(starts, deep=True), vtk.arrays.numpy_to_vtkIdTypeArray(corners, deep=True)
-    )
-    mesh = vtk.PolyData(points=points, polys=cells)
-    normals = vtk.PolyDataNormals(input_data=mesh, splitting=False, consistency=False)
-    normals.Update()
-    mesh.point_data.SetNormals(normals.GetOutput().point_data.normals)
-    actor = vtk.Actor(mapper=vtk.PolyDataMapper(input_data=mesh))
-    actor.property.SetInterpolationToPhong()
-    return actor
 
 
 def save(vtk: Any, window: Any, file: Path | str) -> None:
