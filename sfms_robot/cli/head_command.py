@@ -10,6 +10,7 @@ from pathlib import Path
 
 from typer import Argument, Exit, Option, Typer
 
+from sfms_robot.app.output_paths import checked_png
 from sfms_robot.cli.show import JSON, Result, aside, cell, counted, print_rows, say, show
 from sfms_robot.errors import INTERRUPTED, ConfigError, TorqueError
 
@@ -75,7 +76,6 @@ def list_heads(
 
     if urdf is not None:
         from sfms_robot.app.head.head_scene import draw_shipped_heads
-        from sfms_robot.app.output_paths import checked_png
 
         draw_shipped_heads(checked_png(urdf, "--urdf"))
     show({"heads": shipped_heads()}, json)
@@ -93,7 +93,6 @@ def check(
     """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
     from sfms_robot.app.head.head_check import check as check_head
     from sfms_robot.app.head.head_check import plot as draw
-    from sfms_robot.app.output_paths import checked_png
 
     if plot is not None:
         checked_png(plot, "--plot")
@@ -163,7 +162,6 @@ def show_head(
     """Every value of every joint, and where it comes from: the head's file, or the calibration or fit of this build."""
     if urdf is not None:
         from sfms_robot.app.head.head_scene import draw_scene
-        from sfms_robot.app.output_paths import checked_png
 
         drawn = draw_scene(name, checked_png(urdf, "--urdf"), packages)
         show(

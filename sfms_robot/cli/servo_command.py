@@ -7,16 +7,20 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, Row, aside, counted, print_json, print_rows, show, with_shared_options
+from sfms_robot.cli.show import JSON, Later, Row, aside, counted, print_json, print_rows, show, with_shared_options
 from sfms_robot.errors import BusError, ConfigError, ServoError
 
 if TYPE_CHECKING:
+    from sfms_robot.app import progress
+    from sfms_robot.app.servo import single_servo
     from sfms_robot.app.servo.serial_line import FoundServo, Wire
+else:
+    progress, single_servo = Later("sfms_robot.app.progress"), Later("sfms_robot.app.servo.single_servo")
 
 app = Typer(help="Servos: find them, read and write their registers, set id and rate.", no_args_is_help=True)
 
@@ -57,11 +61,9 @@ def scan(
     ids: str | None = Option(None, help="Ask these one by one, as 1-9,12. Default: all."),
 ) -> None:
     """Find the servos on a wire, and their rates."""
-    from sfms_robot.app.servo.single_servo import scan_all
-
-    asked = _parsed(ids) if ids is not None else None
-    with on.open() as wire, _bar("scanning", hidden=on.json) as progress:
-        found, hint = scan_all(wire, asked, progress)
+    asked = single_servo.checked_ids(ids) if ids is not None else None
+    with on.open() as wire, progress.bar("scanning", hidden=on.json) as step:
+        found, hint = single_servo.scan_all(wire, asked, step)
         rows, where = [seen.row() for seen in found], wire.port.name
     title = f"{counted(len(rows), 'servo')} on {where}{f': {hint}' if hint else ''}"
     _show(rows, {"port": where, "servos": rows, "hint": hint}, on.json, title)
@@ -71,11 +73,9 @@ def scan(
 @with_shared_options
 def ping(on: Wiring, ids: str = IDS) -> None:
     """Check that servos answer, and show their models."""
-    from sfms_robot.app.progress import tracked
-
     rows: list[Row] = []
     with on.open() as wire:
-        for servo in tracked(_parsed(ids), "asking"):
+        for servo in progress.tracked(single_servo.checked_ids(ids), "asking"):
             try:
                 rows.append({**wire.find(servo).row(), "answers": True})
             except (BusError, ServoError):
@@ -94,9 +94,7 @@ def read(
     registers: list[str] = Argument(..., metavar="REGISTER...", help="Names, or 'all'."),
 ) -> None:
     """Read registers by name: raw and in their unit."""
-    from sfms_robot.app.servo.single_servo import read_registers
-
-    _each(ids, on, "registers", lambda seen: read_registers(seen, registers))
+    _each(ids, on, "registers", lambda seen: single_servo.read_registers(seen, registers))
 
 
 @app.command()
@@ -108,14 +106,12 @@ def monitor(
     rate: float = Option(5.0, min=0.1, max=50.0, help="Samples per second."),
 ) -> None:
     """Show position, load, voltage, temperature and faults, live. Reads only."""
-    from sfms_robot.app.servo.single_servo import samples as looks
-
     taken: Sequence[Sequence[Row]] = []
     with on.open() as wire:
-        with _bar("looking for servos", hidden=on.json) as progress:
-            servos = _chosen(wire, ids, progress)
+        with progress.bar("looking for servos", hidden=on.json) as step:
+            servos = _chosen(wire, ids, step)
         count = samples if samples is not None else 1 if on.json else None
-        seen = looks(servos, 1.0 / rate, count)
+        seen = single_servo.samples(servos, 1.0 / rate, count)
         if on.json:
             taken = list(seen)
         else:
@@ -168,8 +164,8 @@ def doctor(
     from sfms_robot.cli.show_servo import print_doctor
 
     confirm = confirmation(yes) if fix else None
-    with _bar("looking", hidden=json or fix) as progress:
-        report = examine(port, head, family, baud, progress, confirm)
+    with progress.bar("looking", hidden=json or fix) as step:
+        report = examine(port, head, family, baud, step, confirm)
     show(report, json, print_doctor)
 
 
@@ -186,11 +182,8 @@ def write(
     yes: bool = YES,
 ) -> None:
     """Write a register and read it back. EEPROM is asked about first, and refused while torque is on."""
-    from sfms_robot.app.servo.single_servo import write_register
-
     confirm = confirmation(yes, ids)
-
-    _each(ids, on, "written", lambda seen: [write_register(seen, register, value, confirm)])
+    _each(ids, on, "written", lambda seen: [single_servo.write_register(seen, register, value, confirm)])
 
 
 @app.command(context_settings={"ignore_unknown_options": True})
@@ -237,13 +230,10 @@ def dump(
     ids: str | None = Option(None, help="1-9,12. Default: all."),
 ) -> None:
     """Write all registers of servos to a YAML file."""
-    from sfms_robot.app.servo.single_servo import check_new, save_dump
-    from sfms_robot.app.servo.single_servo import dump as taken
-
-    check_new(file)
-    with on.open() as wire, _bar("reading", hidden=on.json) as progress:
-        servos = _chosen(wire, ids, progress)
-        save_dump(taken(servos), file)
+    single_servo.check_new(file)
+    with on.open() as wire, progress.bar("reading", hidden=on.json) as step:
+        servos = _chosen(wire, ids, step)
+        single_servo.save_dump(single_servo.dump(servos), file)
     rows = [seen.row() for seen in servos]
     _show(rows, {"file": str(file), "servos": rows}, on.json)
 
@@ -259,11 +249,9 @@ def restore(
     yes: bool = YES,
 ) -> None:
     """Write the EEPROM of a dumped servo to one of the same model. Shows the differences and asks."""
-    from sfms_robot.app.servo.single_servo import Dump
-    from sfms_robot.app.servo.single_servo import restore as write_back
     from sfms_robot.config.base import load
 
-    kept = {each.id: each for each in load(Dump, file).servos}
+    kept = {each.id: each for each in load(single_servo.Dump, file).servos}
     if source is None and into is not None:
         raise ConfigError("servo restore: --into needs --from, the id in the file")
     if source is not None and source not in kept:
@@ -271,7 +259,11 @@ def restore(
     pairs = kept if source is None else {source if into is None else into: kept[source]}
     confirm = confirmation(yes)
     with on.open() as wire:
-        rows = [row for servo, was in pairs.items() for row in write_back(wire.find(servo), was, confirm, identity)]
+        rows = [
+            row
+            for servo, was in pairs.items()
+            for row in single_servo.restore(wire.find(servo), was, confirm, identity)
+        ]
     _show(rows, {"written": rows}, on.json, "" if rows else "nothing differs")
 
 
@@ -285,9 +277,7 @@ def set_id(
     yes: bool = YES,
 ) -> None:
     """Give a servo another id. Best with that one servo on the wire."""
-    from sfms_robot.app.servo.single_servo import set_id as change
-
-    _each(str(old), on, "servos", lambda seen: [change(seen, new, confirmation(yes), in_chain).row()])
+    _each(str(old), on, "servos", lambda seen: [single_servo.set_id(seen, new, confirmation(yes), in_chain).row()])
 
 
 @app.command("set-baud")
@@ -299,20 +289,16 @@ def set_baud(
     yes: bool = YES,
 ) -> None:
     """Give servos another rate, and check that they answer at it."""
-    from sfms_robot.app.servo.single_servo import set_baud as change
-
     confirm = confirmation(yes, ids)
-    _each(ids, on, "servos", lambda seen: [change(seen, rate, confirm).row()])
+    _each(ids, on, "servos", lambda seen: [single_servo.set_baud(seen, rate, confirm).row()])
 
 
 @app.command()
 @with_shared_options
 def reboot(on: Wiring, ids: str = IDS, yes: bool = YES) -> None:
     """Start servos over: torque goes off, latched hardware errors are cleared."""
-    from sfms_robot.app.servo.single_servo import reboot as restart
-
     confirm = confirmation(yes, ids)
-    _each(ids, on, "servos", lambda seen: [restart(seen, confirm).row()])
+    _each(ids, on, "servos", lambda seen: [single_servo.reboot(seen, confirm).row()])
 
 
 @app.command("factory-reset")
@@ -326,9 +312,7 @@ def factory_reset(
     yes: bool = YES,
 ) -> None:
     """Set a servo to its factory values."""
-    from sfms_robot.app.servo.single_servo import factory_reset as reset
-
-    _each(str(servo), on, "servos", lambda seen: [reset(seen, keep, confirmation(yes)).row()])
+    _each(str(servo), on, "servos", lambda seen: [single_servo.factory_reset(seen, keep, confirmation(yes)).row()])
 
 
 # --- shared -----------------------------------------------------------------------------------------------------
@@ -355,17 +339,13 @@ def confirmation(yes: bool, ids: str = "") -> Callable[[str], bool]:
     return ask
 
 
-def _parsed(ids: str) -> list[int]:
-    from sfms_robot.app.servo.single_servo import checked_ids
-
-    return checked_ids(ids)
-
-
-def _chosen(wire: Wire, ids: str | None, progress: Any) -> list[FoundServo]:
+def _chosen(wire: Wire, ids: str | None, step: progress.Progress) -> list[FoundServo]:
     """Return the servos of `ids`, or all. Raises BusError when none answers."""
-    from sfms_robot.app.servo.single_servo import scan as look
-
-    servos = [wire.find(servo) for servo in _parsed(ids)] if ids is not None else look(wire, None, progress)
+    servos = (
+        [wire.find(servo) for servo in single_servo.checked_ids(ids)]
+        if ids is not None
+        else single_servo.scan(wire, None, step)
+    )
     if not servos:
         raise BusError(f"{wire.port.name}: no servo answers")
     return servos
@@ -374,7 +354,7 @@ def _chosen(wire: Wire, ids: str | None, progress: Any) -> list[FoundServo]:
 def _each(ids: str, on: Wiring, key: str, work: Callable[[FoundServo], Sequence[Row]]) -> None:
     """Do `work` for every id; the rows of the first ids are shown even when a later one fails."""
     rows: list[Row] = []
-    servos = _parsed(ids)
+    servos = single_servo.checked_ids(ids)
     try:
         with on.open() as wire:
             for servo in servos:
@@ -397,9 +377,3 @@ def _for_people(row: Row) -> Row:
     takes = None if row["min"] is None else f"{row['min']}..{row['max']}"
     kept = {key: row[key] for key in ("id", "register", "raw", "value", "unit")}
     return {**kept, "takes": takes, "kept in": f"{row['area']} ({row['access']})"}
-
-
-def _bar(text: str, hidden: bool) -> Any:
-    from sfms_robot.app.progress import bar
-
-    return bar(text, hidden)

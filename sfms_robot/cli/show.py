@@ -13,6 +13,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
+from importlib import import_module
 from itertools import chain
 from string import Formatter
 from typing import TYPE_CHECKING, Any
@@ -49,6 +50,16 @@ _WORDS = {
     "voltage_V": "V",
     "whole": "complete",
 }  # keys of results that are printed in other words; of any other key the underscores become spaces
+
+
+class Later:
+    """A module that is imported when one of its names is first used."""
+
+    def __init__(self, module: str) -> None:
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(import_module(self._module), name)
 
 
 def show(

@@ -11,12 +11,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from typer import Argument, Exit, Option, Typer
 
-from sfms_robot.cli.show import JSON, Result, aside, cell, print_rows, say, show, with_shared_options
+from sfms_robot.cli.show import JSON, Later, Result, aside, cell, print_rows, say, show, with_shared_options
 from sfms_robot.data import listener_names
 from sfms_robot.errors import INTERRUPTED, ConfigError
 
 if TYPE_CHECKING:
-    from sfms_robot.lab.learning.train_runs import TrainOptions
+    from sfms_robot.lab.corpora import data_commands
+    from sfms_robot.lab.learning import train_runs
+else:
+    data_commands = Later("sfms_robot.lab.corpora.data_commands")
+    train_runs = Later("sfms_robot.lab.learning.train_runs")
 
 app = Typer(help="Train a listener: its tokenizer, its predictor; and when it does what.", no_args_is_help=True)
 data_app = Typer(help="Training data: compose dyads, check and convert data sets.", no_args_is_help=True)
@@ -78,21 +82,19 @@ def tokenizer(
     ),
 ) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
-    from sfms_robot.lab.learning.train_runs import train_tokenizer
-
-    _train(train_tokenizer, flags, {"placement": placement} if placement else {})
+    _train(train_runs.train_tokenizer, flags, {"placement": placement} if placement else {})
 
 
 @app.command()
 @with_shared_options
 def listener(flags: PhaseFlags) -> None:
     """Phase 2: the next-token predictor, on the tokenizer found in --out."""
-    from sfms_robot.lab.learning.train_runs import train_listener
-
-    _train(train_listener, flags, {})
+    _train(train_runs.train_listener, flags, {})
 
 
-def _train(work: Callable[[TrainOptions], dict[str, Any]], flags: PhaseFlags, changes: Mapping[str, str]) -> None:
+def _train(
+    work: Callable[[train_runs.TrainOptions], dict[str, Any]], flags: PhaseFlags, changes: Mapping[str, str]
+) -> None:
     """Run a phase of training, or one step of every phase, and print its figures."""
     if flags.dry_run:
         from sfms_robot.config import load_training
@@ -101,11 +103,9 @@ def _train(work: Callable[[TrainOptions], dict[str, Any]], flags: PhaseFlags, ch
         note = "hours of all stages, computed; {assumed}"
         show(dry_run(load_training(flags.config)), flags.json, keys=("rows", "hours"), note=note)
         return
-    from sfms_robot.lab.learning.train_runs import TrainOptions
-
     if flags.data is None or flags.out is None:
         raise ConfigError(f"{'--data' if flags.data is None else '--out'} is missing; only --dry-run goes without")
-    options = TrainOptions(
+    options = train_runs.TrainOptions(
         file=flags.config,
         data=flags.data,
         out=flags.out,
@@ -145,9 +145,7 @@ def pack(
     json: bool = JSON,
 ) -> None:
     """Write what a training reads of its data to one file: a trainer elsewhere begins at once."""
-    from sfms_robot.lab.learning.train_runs import pack_data
-
-    show(pack_data(config, data, out, order), json)
+    show(train_runs.pack_data(config, data, out, order), json)
 
 
 @app.command()
@@ -196,9 +194,7 @@ def compose(
     json: bool = JSON,
 ) -> None:
     """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
-    from sfms_robot.lab.corpora.data_commands import compose_dyads
-
-    composed = compose_dyads(data, out, minutes, seed, overwrite, jobs)
+    composed = data_commands.compose_dyads(data, out, minutes, seed, overwrite, jobs)
     show(composed, json, heading=f"minutes of dyads written to {out}")
 
 
@@ -212,9 +208,7 @@ def check(
     json: bool = JSON,
 ) -> None:
     """Read a whole data set once: its contents, and everything that is wrong with it."""
-    from sfms_robot.lab.corpora.data_commands import check_data
-
-    report = check_data(folder, layout, order, window)
+    report = data_commands.check_data(folder, layout, order, window)
     show(report, json, partial(_print_data, channels=channels))
     if not report["usable"]:
         raise Exit(2)
@@ -233,9 +227,7 @@ def convert(
     json: bool = JSON,
 ) -> None:
     """Convert a data set into dyads at 25 fps in our own space, and report the loss."""
-    from sfms_robot.lab.corpora.data_commands import convert_data
-
-    converted = convert_data(folder, out, layout, order, flame_matrix, flame_order)
+    converted = data_commands.convert_data(folder, out, layout, order, flame_matrix, flame_order)
     show(converted, json, _print_conversion)
 
 
