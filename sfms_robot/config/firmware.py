@@ -41,7 +41,7 @@ class Register(Model):
     bits below are the magnitude; `offset_2048`, where 2048 stands for zero. `min`, `max` and `initial` come after it.
     """
 
-    address: Annotated[int, Field(ge=0, le=65535)]
+    address: int = Field(ge=0, le=65535)
     size: Literal[1, 2, 4]
     access: Literal["R", "RW"]
     area: Literal["EEPROM", "RAM"]
@@ -49,7 +49,7 @@ class Register(Model):
     scale: Finite = 1.0
     min: int | None = None
     max: int | None = None
-    signed: Annotated[str, Field(pattern=_SIGN_RULE)] = "no"
+    signed: str = Field(default="no", pattern=_SIGN_RULE)
     initial: int | None = None
 
     @property
@@ -103,8 +103,8 @@ class Register(Model):
 class FirmwareRange(Model):
     """The firmware versions that a map holds for; an end left out is open."""
 
-    min: Annotated[int, Field(ge=0, le=255)] = 0
-    max: Annotated[int, Field(ge=0, le=255)] = 255
+    min: int = Field(default=0, ge=0, le=255)
+    max: int = Field(default=255, ge=0, le=255)
 
     def contradictions(self) -> Iterator[str]:
         if self.min > self.max:
@@ -137,7 +137,7 @@ class FirmwareMap(Model):
     firmware: FirmwareRange = FirmwareRange()
     variant_of: str | None = None  # the model this is another firmware's layout of
     same_number_as: str | None = None  # a model that the number alone cannot tell from this one
-    source: Annotated[str, Field(min_length=1)]
+    source: str = Field(min_length=1)
     ticks_per_revolution: Positive
     center_ticks: int
     no_load_speed_deg_s: Positive | None = None  # None: not known
@@ -161,17 +161,17 @@ class FirmwareMap(Model):
         allowed = {"dynamixel": (1, 2), "feetech": (1,)}.get(self.family, (None,))
         if self.protocol not in allowed:
             yield f"protocol = {self.protocol} is not one of family {self.family} ({', '.join(map(str, allowed))})"
-        board = {"channels": self.channels, "pulse_us": self.pulse_us, "tick_us": self.tick_us}
-        if self.family in ("maestro", "ssc32"):
-            yield from (f"{key} is missing: a {self.family} board has it" for key, value in board.items() if not value)
-            if self.pulse_us and self.pulse_us.min >= self.pulse_us.max:
-                yield f"pulse_us.min = {self.pulse_us.min} is not below pulse_us.max = {self.pulse_us.max}"
-            if self.registers:
-                yield f"registers: a {self.family} board has none"
-        else:
-            yield from (f"{key} belongs to a board, not to family {self.family}" for key, v in board.items() if v)
-            if not self.registers:
-                yield "registers is empty"
+        board = self.family in ("maestro", "ssc32")
+        problem = (
+            f"is missing: a {self.family} board has it" if board else f"belongs to a board, not to family {self.family}"
+        )
+        yield from (
+            f"{key} {problem}" for key in ("channels", "pulse_us", "tick_us") if bool(getattr(self, key)) != board
+        )
+        if board and self.pulse_us and self.pulse_us.min >= self.pulse_us.max:
+            yield f"pulse_us.min = {self.pulse_us.min} is not below pulse_us.max = {self.pulse_us.max}"
+        if bool(self.registers) == board:
+            yield f"registers: a {self.family} board has none" if board else "registers is empty"
 
     def _layout(self) -> Iterator[str]:
         """Yield registers that overlap, leave the address space, or cannot hold their values."""
@@ -195,9 +195,8 @@ class FirmwareMap(Model):
                 yield f"roles.{role} = {name!r} is not a register of this map"
         rates: dict[int, int] = {}
         for code, rate in self.baud_codes.items():
-            if rate in rates:
-                yield f"baud_codes.{code} = {rate} is also code {rates[rate]}"
-            rates.setdefault(rate, code)
+            if (other := rates.setdefault(rate, code)) != code:
+                yield f"baud_codes.{code} = {rate} is also code {other}"
 
 
 def user_maps() -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
@@ -86,9 +86,9 @@ class Idle(Model):
         fade_s: how long the listener has to be still before idle motion is back in full.
     """
 
-    blinks_per_minute: Annotated[float, Field(ge=0, le=60)] = 14.0
-    head_deg: Annotated[float, Field(ge=0, le=10)] = 1.2
-    glance_deg: Annotated[float, Field(ge=0, le=15)] = 3.0
+    blinks_per_minute: float = Field(default=14.0, ge=0, le=60)
+    head_deg: float = Field(default=1.2, ge=0, le=10)
+    glance_deg: float = Field(default=3.0, ge=0, le=15)
     still_deg_s: Positive = 3.0
     fade_s: Positive = 3.0
 
@@ -103,7 +103,7 @@ class Person(Model):
     """
 
     head_share: Share = 0.6
-    look_away: Annotated[float, Field(ge=0, le=2)] = 1.0
+    look_away: float = Field(default=1.0, ge=0, le=2)
 
 
 class Life(Model):
@@ -120,7 +120,7 @@ class FollowingJoint(Model):
     `scale` is 1 or -1 for a joint that turns as ours does, metres per radian for one that slides.
     """
 
-    joint: Annotated[str, Field(min_length=1)]
+    joint: str = Field(min_length=1)
     scale: Finite = 1.0
     offset: Finite = 0.0
 
@@ -133,7 +133,7 @@ class RobotDescription(Model):
         joints: our joint -> joint of the URDF; one that is not named here drives the joint of its own name.
     """
 
-    file: Annotated[str, Field(min_length=1)]
+    file: str = Field(min_length=1)
     packages: dict[str, str] = {}
     joints: dict[Name, FollowingJoint] = {}
 
@@ -156,16 +156,16 @@ class Head(Model):
     slowly until they have been measured.
     """
 
-    version: Annotated[int, Field(ge=1, le=VERSION)] = VERSION
+    version: int = Field(default=VERSION, ge=1, le=VERSION)
     name: Name
     description: str
     calibrate_first: bool = False
-    buses: Annotated[dict[Name, BusConfig], Field(min_length=1)]
+    buses: dict[Name, BusConfig] = Field(min_length=1)
     limits: dict[Name, LimitClass]
     safety: Safety = Safety()
     faults: Faults = Faults()
     joint_defaults: JointDefaults = JointDefaults()
-    joints: Annotated[dict[Name, Joint], Field(min_length=1)]
+    joints: dict[Name, Joint] = Field(min_length=1)
     expressions: dict[Name, Expression] = {}
     couplings: tuple[Coupling, ...] = ()
     folds: tuple[Fold, ...] = ()
@@ -270,11 +270,11 @@ def held_back(head: Head, joints: Collection[str] | None = None) -> Head:
     names = head.joints if joints is None else joints
     limits, held = dict(head.limits), dict(head.joints)
     for name in names:
-        joint, rest = head.joints[name], head.joints[name].rest_deg
-        slow = {key: PACE * value for key, value in head.limits[joint.limits]}
-        limits[joint.limits + _SUFFIX] = LimitClass(**slow)
-        ends = {"min_deg": rest + TRAVEL * (joint.min_deg - rest), "max_deg": rest + TRAVEL * (joint.max_deg - rest)}
-        held[name] = joint.replaced(**ends, limits=joint.limits + _SUFFIX)
+        joint = head.joints[name]
+        rest, slow = joint.rest_deg, joint.limits + _SUFFIX
+        limits[slow] = LimitClass(**{key: PACE * value for key, value in head.limit(name)})
+        low, high = (rest + TRAVEL * (end - rest) for end in (joint.min_deg, joint.max_deg))
+        held[name] = joint.replaced(min_deg=low, max_deg=high, limits=slow)
     return head.replaced(limits=limits, joints=held)
 
 
@@ -310,7 +310,7 @@ def _inlined(node: Expression, expressions: Mapping[str, Expression]) -> Express
         return shared if node == Expression(use=node.use) else plain.replaced(sum=(shared,))
     if node.group is None:
         return node
-    return node.model_copy(update={node.group: tuple(_inlined(part, expressions) for part in node.parts)})
+    return node.replaced(**{node.group: tuple(_inlined(part, expressions) for part in node.parts)})
 
 
 def mirrored(node: Expression) -> Expression:
@@ -321,7 +321,7 @@ def mirrored(node: Expression) -> Expression:
     if node.channel is not None:
         return node.replaced(channel=other_side(node.channel))
     assert node.group is not None
-    return node.model_copy(update={node.group: tuple(mirrored(part) for part in node.parts)})
+    return node.replaced(**{node.group: tuple(map(mirrored, node.parts))})
 
 
 def other_side(channel: str) -> str:

@@ -120,9 +120,9 @@ class Coupling(Model):
     Where the sum would be less, the joints under `moving` give way, the first as far as its range goes, then the next.
     """
 
-    keep: Annotated[dict[Name, Gain], Field(min_length=2)]
-    at_least: Annotated[float, Field(le=0, ge=-1000)]  # at rest the sum is 0: rest has to be allowed
-    moving: Annotated[tuple[Name, ...], Field(min_length=1)]
+    keep: dict[Name, Gain] = Field(min_length=2)
+    at_least: float = Field(le=0, ge=-1000)  # at rest the sum is 0: rest has to be allowed
+    moving: tuple[Name, ...] = Field(min_length=1)
 
     def contradictions(self) -> Iterator[str]:
         for name in self.moving:
@@ -149,7 +149,7 @@ class Region(Model):
         style: how much of the fine detail shows; 0 lets only large motions through, 2 doubles the small ones.
     """
 
-    joints: Annotated[tuple[Name, ...], Field(min_length=1)]
+    joints: tuple[Name, ...] = Field(min_length=1)
     intensity: Knob = 1.0
     style: Knob = 1.0
 
@@ -197,7 +197,7 @@ class Safety(Model):
 
     def merged(self, other: Safety | None) -> Safety:
         """Return this, overridden by the keys that `other` gives explicitly."""
-        return self if other is None else self.model_copy(update={k: getattr(other, k) for k in other.model_fields_set})
+        return self if other is None else self.replaced(**{key: getattr(other, key) for key in other.model_fields_set})
 
 
 class Threshold(Model):
@@ -233,7 +233,7 @@ class Joint(Model):
     """
 
     bus: Name
-    id: Annotated[int, Field(ge=0, le=252)]
+    id: int = Field(ge=0, le=252)
     model: ModelName
     zero_ticks: int
     sign: Literal[1, -1] = 1
@@ -316,11 +316,11 @@ class BusConfig(Model):
 
     family: Annotated[str, AfterValidator(_family), WithJsonSchema({"enum": list(BUS_FAMILIES)})]
     baud: PositiveInt
-    rate_hz: Annotated[float, Field(gt=0, le=1000)] = 100.0
-    read_deadline_ms: Annotated[float, Field(gt=0, le=100)] = 3.0
+    rate_hz: float = Field(default=100.0, gt=0, le=1000)
+    read_deadline_ms: float = Field(default=3.0, gt=0, le=100)
     fast_read: Literal["auto", "on", "off"] = "auto"
-    watchdog_ms: Annotated[int, Field(ge=0, le=2540)] = 200
-    stagger_ms: Annotated[float, Field(ge=0, le=1000)] = 5.0
+    watchdog_ms: int = Field(default=200, ge=0, le=2540)
+    stagger_ms: float = Field(default=5.0, ge=0, le=1000)
     reconnect_s: Positive = 30.0
     rs485: Literal["rts", "kernel"] | None = None
     crc: Annotated[bool, AfterValidator(_crc)] = False

@@ -60,7 +60,7 @@ class SerialNeck(Model):
     """A neck of axes one on top of the other, from the base to the head; an axis has the angle of its joint."""
 
     kind: Literal["serial"]
-    order: Annotated[tuple[AxisName, ...], Field(min_length=1, max_length=3)]
+    order: tuple[AxisName, ...] = Field(min_length=1, max_length=3)
     axes: dict[AxisName, AxisJoints] = {}
     differential: Differential | None = None
 
@@ -106,7 +106,7 @@ class PoseLimits(Model):
     """Largest lean of the head against the body, also where the legs could reach farther."""
 
     roll_deg: Positive = 180.0
-    pitch_deg: Annotated[float, Field(gt=0, lt=90)] = 89.0
+    pitch_deg: float = Field(default=89.0, gt=0, lt=90)
     yaw_deg: Positive = 180.0
 
 
@@ -125,7 +125,7 @@ class StewartPlatform(Model):
     crank_m: Positive
     rod_m: Positive
     home_height_m: Finite
-    legs: Annotated[tuple[Leg, ...], Field(min_length=6, max_length=6)]
+    legs: tuple[Leg, ...] = Field(min_length=6, max_length=6)
     limits: PoseLimits = PoseLimits()
     body_yaw: BodyYaw | None = None
 

@@ -66,7 +66,7 @@ class ChannelGroup(Model):
         transition_bias: on the logit of class 0, more for fewer keyframes.
     """
 
-    channels: Annotated[tuple[str, ...], Field(min_length=1)]
+    channels: tuple[str, ...] = Field(min_length=1)
     levels: Levels
     keyframes: Count | None = None
     keyframe_cost: Positive | None = None
@@ -123,7 +123,7 @@ class Sampling(Model):
     """
 
     temperature: Positive = 1.0
-    nucleus: Annotated[float, Field(gt=0, le=1)] = 1.0
+    nucleus: float = Field(default=1.0, gt=0, le=1)
     seam_frames: Count = 4
     smoothing: Share = 0.0
     reach: bool = True
@@ -223,7 +223,7 @@ class Sfms(ListenerSettings):
     placement: Placement = "exact"
     max_gap_frames: Count = 24
     ramp_frames: Count | None = None
-    groups: Annotated[dict[Name, ChannelGroup], Field(min_length=1)]
+    groups: dict[Name, ChannelGroup] = Field(min_length=1)
     scores: Scores = Scores()
     quantizer: Literal["fsq", "vq"] = "fsq"
     code_dims: Count = 4
@@ -254,9 +254,8 @@ class Sfms(ListenerSettings):
         elif wanted["preset"] == "all":
             sets = {channel: (channel,) for channel in channels}
         elif wanted["preset"] == "four" and space != "deca56":  # FLAME's components are not parts of a face
-            sets = {"neck": (), "brows": (), "eyes": (), "mouth": ()}
-            for channel in channels:
-                sets[_part(channel)] += (channel,)
+            parts = ("neck", "brows", "eyes", "mouth")
+            sets = {part: tuple(each for each in channels if _part(each) == part) for part in parts}
         else:
             raise ValueError(f"groups.preset: {wanted['preset']!r} is none of one, four (not for deca56), all")
         rest = {key: wanted[key] for key in ("levels", "keyframes")}
@@ -277,11 +276,11 @@ class Sfms(ListenerSettings):
             yield f"groups: no group holds {', '.join(missing)}"
         if len({len(group.levels) for group in self.groups.values()}) != 1:
             yield "groups: every group needs the same number of levels"
+        penalised = self.placement == "penalised"
+        key, other = ("keyframe_cost", "keyframes") if penalised else ("keyframes", "keyframe_cost")
         for name, group in self.groups.items():
-            if self.placement == "penalised" and (group.keyframe_cost is None or group.keyframes is not None):
-                yield f"groups.{name}: placement penalised takes keyframe_cost, not keyframes"
-            if self.placement != "penalised" and (group.keyframes is None or group.keyframe_cost is not None):
-                yield f"groups.{name}: placement {self.placement} takes keyframes, not keyframe_cost"
+            if getattr(group, key) is None or getattr(group, other) is not None:
+                yield f"groups.{name}: placement {self.placement} takes {key}, not {other}"
         for kind in ("nod", "smile"):
             if getattr(self.sampling, kind) is not None and not self.events:
                 yield f"sampling.{kind}: expected events: true, without which there is no {kind}"
@@ -346,9 +345,9 @@ class Diffusion(Model):
         clamp: every estimate of the clean motion is kept within the range of the data; (4) does not.
     """
 
-    width: Annotated[int, Field(ge=2, multiple_of=2)] = 262
+    width: int = Field(default=262, ge=2, multiple_of=2)
     blocks: Count = 3
-    train_steps: Annotated[int, Field(ge=2)] = 1000
+    train_steps: int = Field(default=1000, ge=2)
     schedule: Literal["cosine", "logarithmic"] = "cosine"
     steps: Count = 15
     sampler: Literal["ddpm", "ddim"] = "ddpm"
@@ -393,7 +392,7 @@ class Arig(ListenerSettings):
     feedforward: Count = 2048
     heads: Count = 8
     chunk_frames: Count = 6
-    context_chunks: Annotated[int, Field(ge=2)] = 512
+    context_chunks: int = Field(default=512, ge=2)
     bidirectional_layers: Count = 2
     integrated_layers: Count = 1
     context_layers: Count = 4

@@ -43,7 +43,7 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 class Identity(Model):
     """Identity of a servo. None where the family does not report it; `drive_mode` holds the direction bit alone."""
 
-    id: Annotated[int, Field(ge=0, le=253)]
+    id: int = Field(ge=0, le=253)
     model: str
     firmware: int | None = None
     homing_offset: int | None = None

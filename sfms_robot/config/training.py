@@ -135,7 +135,7 @@ class Stage(Model):
             lack is left out.
     """
 
-    share: Annotated[float, Field(gt=0, le=1)]
+    share: float = Field(gt=0, le=1)
     speaking: NonNegative = 0.0
     listening: NonNegative = 0.0
     interaction: NonNegative = 0.0
@@ -183,7 +183,7 @@ class ArigPhase(Phase):
         stages: the curriculum, in order; shares add up to 1.
     """
 
-    window_frames: Annotated[int, Field(ge=2)] = 96
+    window_frames: int = Field(default=96, ge=2)
     draws: Count = 4
     state_weight: NonNegative = 0.1
     coarse_weight: NonNegative = 0.5
@@ -201,10 +201,13 @@ class ArigPhase(Phase):
     gain_db: NonNegative = 6.0
     colour_db: NonNegative = 6.0
     grain_db: NonNegative = 2.0
-    stages: Annotated[tuple[Stage, ...], Field(min_length=1)] = (
-        Stage(share=0.15, speaking=1.0),
-        Stage(share=0.35, speaking=0.2, listening=0.8),
-        Stage(share=0.5, speaking=0.15, listening=0.5, interaction=0.35),
+    stages: tuple[Stage, ...] = Field(
+        default=(
+            Stage(share=0.15, speaking=1.0),
+            Stage(share=0.35, speaking=0.2, listening=0.8),
+            Stage(share=0.5, speaking=0.15, listening=0.5, interaction=0.35),
+        ),
+        min_length=1,
     )
 
     def contradictions(self) -> Iterator[str]:
@@ -256,7 +259,7 @@ class Baseline(Model):
         layers: transformer blocks of the encoder, and as many of the decoder.
     """
 
-    window_frames: Annotated[int, Field(ge=1)] = 48
+    window_frames: Count = 48
     quantizer: Literal["fsq", "vq"]
     levels: Levels
     code_dims: Count = 8
@@ -293,5 +296,5 @@ class Recipe(Model):
     """One tokenizer of the comparison tables and how it is trained; its keyframes are for an sfms tokenizer alone."""
 
     seed: Seed = 1
-    model: Annotated[Sfms | Dense | Grouped, Field(discriminator="kind")]
+    model: Sfms | Dense | Grouped = Field(discriminator="kind")
     training: TokenizerTraining
