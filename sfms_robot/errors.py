@@ -53,10 +53,9 @@ class ConfigError(RobotError):
     ) -> ConfigError:
         """`file: key = value problem (valid choices)`, the form every configuration error takes."""
         names = [str(choice) for choice in choices]
-        place = f"{file}: {key} = {value!r}" if key else f"{file}:"
         meant = did_you_mean(value, names) if len(names) > 1 else ""
         listed = f" ({', '.join(names)})" if names and not (meant and len(names) > _MOST_LISTED) else ""
-        return cls(f"{place} {problem}{listed}{meant}")
+        return cls(f"{file}: {key} = {value!r} {problem}{listed}{meant}")
 
 
 def did_you_mean(given: object, choices: Iterable[str]) -> str:

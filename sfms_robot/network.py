@@ -91,16 +91,17 @@ def session_config(role: Role, router: Router = LOCAL) -> zenoh.Config:
         if not router.insecure:
             _check_secure(given, file)
         return given
+    serves = role == "serve"
     settings: dict[str, Any] = {
-        "mode": "router" if role == "serve" else "client",
+        "mode": "router" if serves else "client",
         "scouting/multicast/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
         "connect/retry": RETRY,
         "transport/link/tx/queue/size/real_time": QUEUE,
-        "listen/endpoints": [LOOPBACK] if role == "serve" else [],
-        "connect/endpoints": [] if role == "serve" else [LOOPBACK],
+        "listen/endpoints": [LOOPBACK] if serves else [],
+        "connect/endpoints": [] if serves else [LOOPBACK],
     }
-    if role == "call":
+    if not serves:
         settings["connect/timeout_ms"] = -1  # for ever; `Connection` waits in a thread
     config = zenoh.Config()
     for key, value in settings.items():

@@ -5,7 +5,7 @@ of it, once for all visitors. What seldom changes (state, faults, hazards) is JS
 
     float64   time [s]
     float32   level of the person's voice [dB], of the robot's own, attention, place x, y, z [m]; NaN: unknown
-    uint8     whether the person talks; uint8 0
+    uint8     whether the person talks; a byte of padding
     uint16    J, the number of joints
     float32   motion (58,), joints asked (J,) [rad], joints read (J,) [rad, NaN: never]
     rest      JSON of `s`, `w`, `f`, `h` without its braces
@@ -34,7 +34,7 @@ VERSION: Final = 1
 LONGEST_COMMAND: Final = 8192  # characters
 LONGEST_PERSON: Final = 262_144  # bytes of a binary message: 2.7 s of sound at 48 kHz
 NOTHING: Final = math.nan
-_HEADER: Final = struct.Struct("<d6fBBH")
+_HEADER: Final = struct.Struct("<d6f?xH")
 _DIGITS: Final = 4
 _LONGEST_TEXT: Final = 256
 
@@ -72,16 +72,16 @@ def pack_picture(
         motion: (58,). asked_rad, read_rad: (J,); NaN in the latter where a servo never answered.
         rare: from `rare_json`.
     """
-    x_m, y_m, z_m = (NOTHING, NOTHING, NOTHING) if place_m is None else map(float, place_m)
+    place = [NOTHING] * 3 if place_m is None else place_m
     seen = NOTHING if attention is None else attention
-    header = _HEADER.pack(time_s, voice_db, own_voice_db, seen, x_m, y_m, z_m, talking, 0, len(asked_rad))
+    header = _HEADER.pack(time_s, voice_db, own_voice_db, seen, *place, talking, len(asked_rad))
     numbers = np.concatenate([motion, asked_rad, read_rad], dtype="<f4", casting="same_kind")
     return header + numbers.tobytes() + rare
 
 
 def frame_json(record: bytes, shown: Shown | None = None) -> bytes:
     """Return the `frame` message of a packed picture. `shown` None: no URDF, the joints shown are the head's."""
-    time_s, voice_db, own_db, attention, *place_m, talking, _, joints = _HEADER.unpack_from(record)
+    time_s, voice_db, own_db, attention, *place_m, talking, joints = _HEADER.unpack_from(record)
     count = MOTION_DIM + 2 * joints
     values = np.frombuffer(record, "<f4", count, _HEADER.size).astype(np.float64)
     asked_rad, read_rad = values[MOTION_DIM : MOTION_DIM + joints], values[MOTION_DIM + joints :]
@@ -94,7 +94,7 @@ def frame_json(record: bytes, shown: Shown | None = None) -> bytes:
         "r": read_rad.round(_DIGITS),
         "u": (there_rad if shown is None else shown(there_rad)).round(_DIGITS),
         "db": round(voice_db, 1),  # unknown is NaN, of which JSON makes null; the same below
-        "talk": bool(talking),
+        "talk": talking,
         "own": round(own_db, 1),
         "at": round(attention, _DIGITS),
         "o": None if math.isnan(place_m[0]) else [round(each, _DIGITS) for each in place_m],

@@ -41,8 +41,8 @@ class Address:
 
     host: str = LOOPBACK
     port: int = PORT
-    certificate: str | None = None
-    key: str | None = None
+    certificate: Path | None = None
+    key: Path | None = None
 
     @classmethod
     def parsed(cls, wanted: str, certificate: Path | None = None, key: Path | None = None) -> Address:
@@ -52,13 +52,10 @@ class Address:
         for flag, file in (("--view-cert", certificate), ("--view-key", key)):
             if file is not None and not file.is_file():
                 raise ConfigError(f"{flag} {file}: no such file")
-        files = (None if certificate is None else str(certificate), None if key is None else str(key))
-        if wanted == "auto":
-            return cls(LOOPBACK, PORT, *files)
-        place = host_and_port(wanted)
+        place = (LOOPBACK, PORT) if wanted == "auto" else host_and_port(wanted)
         if place is None:
             raise ConfigError(f"--view {wanted}: not a TCP port (valid: PORT, HOST:PORT, 0 for a free one, none)")
-        return cls(*place, *files)
+        return cls(*place, certificate, key)
 
 
 class Asked(Protocol):
