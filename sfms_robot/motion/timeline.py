@@ -45,6 +45,7 @@ from sfms_robot.frames import (
     Floats,
     Indices,
     Plan,
+    clip_shapes,
 )
 from sfms_robot.signals.minimum_jerk import ease
 
@@ -231,7 +232,7 @@ def _usable(plan: Plan) -> tuple[Doubles, Doubles] | None:
         return None
     if plan.jaw_rad is not None:  # axis-angle; y points left, so + about y lowers the chin
         frames[:, _JAW_OPEN] = plan.jaw_rad[:, 1] / JAW_FULL_OPEN_RAD
-    frames[:, SHAPES] = np.clip(frames[:, SHAPES], 0.0, 1.0)
+    clip_shapes(frames)
     frames[:, POSE] = np.clip(frames[:, POSE], -_FARTHEST, _FARTHEST)
     return times_s, frames
 
@@ -265,7 +266,7 @@ def _here(curve: Curve, at_s: float) -> _Knots:
 def _joined(past: _Knots, times_s: Doubles, frames: Doubles, step_s: float, played_s: float) -> _Knots:
     """Return all knots with the extrapolated last one; slopes that were played are kept, later ones recomputed."""
     overrun = frames[-1] + (frames[-1] - (frames[-2] if len(frames) > 1 else past.values[-1]))
-    overrun[SHAPES] = np.clip(overrun[SHAPES], 0.0, 1.0)
+    clip_shapes(overrun)
     all_times = np.concatenate([past.times_s, times_s, times_s[-1:] + step_s])
     values = np.concatenate([past.values, frames, overrun[None]])
     slopes, bends = _derivatives(all_times, values)

@@ -33,6 +33,7 @@ from sfms_robot.frames import (
     SHAPES,
     Doubles,
     Floats,
+    clip_shapes,
 )
 from sfms_robot.signals.events import runs
 from sfms_robot.signals.face_tables import (
@@ -130,7 +131,7 @@ def read_track(path: Path | str) -> Track:
         )
     if from_camera and np.isfinite(motion[:, 0]).any():
         motion[:, _PLACE] -= np.nanmedian(motion[:, _PLACE], axis=0)
-    motion[:, SHAPES] = np.clip(motion[:, SHAPES], 0.0, 1.0)
+    clip_shapes(motion)
     return Track(times_s[once], motion[once].astype(np.float32), frozenset(columns))
 
 

@@ -35,6 +35,7 @@ from sfms_robot.frames import (
     FaceFrame,
     Floats,
     Sighting,
+    clip_shapes,
 )
 from sfms_robot.signals.face_units import LiveUnits, beyond
 from sfms_robot.signals.rotations import angles_of, rotation
@@ -427,7 +428,7 @@ class UdpSight(LiveFace):
         self._result_s = time_s
         if ours is not None:
             self._counts["faces"] += 1
-            ours[SHAPES] = np.clip(ours[SHAPES], 0.0, 1.0)
+            clip_shapes(ours)
             self.put(time_s, ours)
 
     def _remark(self, time_s: float) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, PacketError
-from sfms_robot.frames import AUDIO_HZ, FRAME_S, SHAPES, Floats, Sighting
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, Floats, Sighting, clip_shapes
 from sfms_robot.network import LOCAL, Ros2Node, Router, ros_domain, ros_topic
 from sfms_robot.signals.face_units import beyond
 from sfms_robot.signals.ros2_messages import ACTION_UNITS, AUDIO, Message, face_of, read_message, wire_name
@@ -131,5 +131,5 @@ class Ros2Sight(_Subscriber, LiveFace):
         motion = face_of(message)
         if (problem := beyond(motion)) is not None:
             raise PacketError(problem)
-        motion[SHAPES] = np.clip(motion[SHAPES], 0.0, 1.0)
+        clip_shapes(motion)
         self.put(self._now(), motion)

@@ -40,6 +40,7 @@ from sfms_robot.frames import (
     FaceFrame,
     Floats,
     SpeakerFrame,
+    clip_shapes,
 )
 from sfms_robot.lab.corpora.clips import Split, split_of_voice
 from sfms_robot.lab.corpora.compose.render_events import lay_smile, speaker_motion
@@ -243,7 +244,7 @@ def jitter(face: Floats, rng: np.random.Generator) -> Floats:
     """Add the scatter of a tracker: 0.3 degrees, 2 mm, 0.03 of a blendshape."""
     sizes = np.r_[np.full(3, np.deg2rad(0.3)), np.full(3, 2e-3), np.full(52, 0.03)]
     out = face + sizes * rng.standard_normal(face.shape)
-    out[:, SHAPES] = out[:, SHAPES].clip(0, 1)
+    clip_shapes(out)
     return np.asarray(out, np.float32)
 
 
@@ -379,7 +380,7 @@ def _smiling(
     onsets_s += rng.uniform(-every_s / 4, every_s / 4, len(onsets_s))
     for start_s in onsets_s.tolist():
         lay_smile(face[:, SHAPES], start_s, sizes.smile_s(rng), rng.uniform(*sizes.THEIR_SMILE), 0.1, motions, rng)
-    face[:, SHAPES] = face[:, SHAPES].clip(0, 1)
+    clip_shapes(face)
     return onsets_s, [
         replace(frame, face=FaceFrame.of(frame.time_s, row)) for frame, row in zip(frames, face, strict=True)
     ]
