@@ -27,6 +27,7 @@ from sfms_robot.config.kinematics import Kinematics, Triple
 from sfms_robot.data import NO_HEAD, head_file
 from sfms_robot.errors import not_one_of
 from sfms_robot.frames import LATERAL_POSE, Doubles
+from sfms_robot.ranges import Range
 
 VERSION: Final = 1  # of a head's file
 NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # keys that a twin does not take over
@@ -194,8 +195,14 @@ class Head(Model):
 
     @property
     def rest_rad(self) -> Doubles:
-        """(J,) angles at rest."""
+        """Angles (J,) of all joints at rest."""
         return np.array([joint.rest_rad for joint in self.joints.values()])
+
+    @property
+    def range(self) -> Range:
+        """Lowest and highest angles (J,) of all joints."""
+        ends = [(joint.min_rad, joint.max_rad) for joint in self.joints.values()]
+        return Range(*np.array(ends).reshape(-1, 2).T)
 
     def on_bus(self, bus: str) -> dict[str, Joint]:
         """Return the joints of one bus, by name."""

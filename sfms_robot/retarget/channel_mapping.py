@@ -26,7 +26,6 @@ from sfms_robot.config import Expression, Head
 from sfms_robot.config.head import drives
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Bools, Doubles, Floats, Indices
-from sfms_robot.ranges import Range
 
 Tree = tuple[int, Expression]  # joint, node
 
@@ -59,11 +58,9 @@ class Units:
 
     @classmethod
     def of(cls, head: Head) -> Units:
-        joints = head.joints.values()
-        rest = head.rest_rad
-        up = np.array([joint.max_rad for joint in joints]) - rest
-        down = rest - np.array([joint.min_rad for joint in joints])
-        in_rad = np.array([joint.unit == "rad" for joint in joints], np.bool_)
+        rest, ends = head.rest_rad, head.range
+        up, down = ends.high - rest, rest - ends.low
+        in_rad = np.array([joint.unit == "rad" for joint in head.joints.values()], np.bool_)
         return cls(
             rest=rest,
             up=np.where(in_rad | (up <= 0), 1.0, up),
@@ -93,8 +90,7 @@ class ChannelMapping:
         self.joints: Sequence[str] = tuple(head.joints)
         self._regions = head.regions
         self._units = Units.of(head)
-        ends = np.array([(joint.min_rad, joint.max_rad) for joint in head.joints.values()])
-        self._range = Range(*ends.reshape(-1, 2).T)
+        self._range = head.range
 
         trees = drives(head)
         self._program = Program.of(list(trees.values()))

@@ -32,7 +32,7 @@ from sfms_robot.config.check import check_head, remarks
 from sfms_robot.config.head import drives
 from sfms_robot.data import data_dir, head_names
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, POSE_CHANNELS, SHAPES, Doubles, Floats
+from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, POSE_CHANNELS, SHAPES, Doubles, Floats, clip_shapes
 from sfms_robot.motion.limits import JointLimits
 from sfms_robot.retarget.head_retargeter import HeadRetargeter, Neck
 from sfms_robot.retarget.response_fit import asked
@@ -289,6 +289,6 @@ def _bundled() -> list[tuple[str, Floats]]:
             for piece in getattr(motions, kind):
                 clip = np.zeros((len(piece), MOTION_DIM), dtype=np.float32)
                 clip[:, columns] = piece
-                clip[:, SHAPES] = np.clip(clip[:, SHAPES], 0.0, 1.0)
+                clip_shapes(clip)
                 clips.append((kind, clip))
     return clips
