@@ -130,7 +130,7 @@ class FirmwareMap(Model):
 
     model: str
     vendor: str
-    model_number: Annotated[int, Field(ge=0, le=65535)] | None = None  # None: not known, so it cannot be checked
+    model_number: int | None = Field(default=None, ge=0, le=65535)  # None: not known, so it cannot be checked
     family: Family
     protocol: Literal[1, 2] | None = None
     byte_order: Literal["little", "big"] = "little"
@@ -146,7 +146,7 @@ class FirmwareMap(Model):
     baud_codes: dict[int, PositiveInt] = {}  # code in role baud_rate -> bit/s
     faults: dict[Bit, str] = {}  # bit of role error_status, or of a board's error word
     status_faults: dict[Bit, str] = {}  # bit of the error byte of every status packet
-    channels: Annotated[int, Field(gt=0, le=255)] | None = None
+    channels: int | None = Field(default=None, gt=0, le=255)
     pulse_us: PulseRange | None = None
     tick_us: Positive | None = None
     roles: dict[Role, Name | None] = {}  # where the register's name is not the role's own

@@ -62,9 +62,9 @@ class Expression(Model):
     max: Parts | None = None
     min: Parts | None = None
     mean: Parts | None = None
-    product: Annotated[Parts, Field(max_length=MOST_FACTORS)] | None = None
+    product: Parts | None = Field(default=None, max_length=MOST_FACTORS)
     dead_band: NonNegative = 0.0
-    curve: Annotated[tuple[tuple[Gain, Gain], ...], Field(min_length=2)] | None = None
+    curve: tuple[tuple[Gain, Gain], ...] | None = Field(default=None, min_length=2)
     gain: Gain = 1.0
     gain_up: Gain | None = None
     gain_down: Gain | None = None
@@ -180,7 +180,7 @@ class Safety(Model):
     """
 
     current_limit_mA: Positive | None = None
-    torque_limit_percent: Annotated[float, Field(gt=0, le=100)] | None = None
+    torque_limit_percent: float | None = Field(default=None, gt=0, le=100)
     on_fault: Literal["hold", "limp", "reduce", "reboot_and_ease_in"] = "limp"
     pinch: LoadRule | None = None
     strain: LoadRule | None = None
