@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final
 
@@ -36,12 +36,13 @@ EYES_S: Final = 0.1  # a saccade of 30 degrees
 HEAD_S: Final = 0.6  # a head turn that follows it
 HEAD_SHARE: Final = 0.6  # of the direction; the eyes keep the rest
 LARGEST_POSE: Final = np.array([math.pi, math.pi, math.pi, 1.0, 1.0, 1.0])  # rad, m
-_NEVER_S: Final = -math.inf
+_ZERO: Final = np.zeros(1)
+_NEVER_S: Final = np.full(1, -math.inf)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """Requested values of C channels and their weights; all arrays are (C,).
+    """Requested values of C channels and their weights; all arrays are (C,), or (1,) before the first command.
 
     Attributes:
         rise_s, fall_s: of a weight, from `start` at `began_s` up to 1, and down to 0 from `until_s` on.
@@ -51,28 +52,13 @@ class Request:
     rise_s: float
     fall_s: float
     change_s: float
-    smooth: bool
-    start: Doubles
-    began_s: Doubles
-    until_s: Doubles
-    before: Doubles
-    after: Doubles
+    smooth: bool = True
+    start: Doubles = field(default_factory=_ZERO.copy)
+    began_s: Doubles = field(default_factory=_NEVER_S.copy)
+    until_s: Doubles = field(default_factory=_NEVER_S.copy)
+    before: Doubles = field(default_factory=_ZERO.copy)
+    after: Doubles = field(default_factory=_ZERO.copy)
     since_s: float = 0.0
-
-    @classmethod
-    def none(cls, size: int, rise_s: float, fall_s: float, change_s: float, smooth: bool = True) -> Request:
-        zero, never = np.zeros(size), np.full(size, _NEVER_S)
-        return cls(
-            rise_s=rise_s,
-            fall_s=fall_s,
-            change_s=change_s,
-            smooth=smooth,
-            start=zero,
-            began_s=never,
-            until_s=never,
-            before=zero,
-            after=zero,
-        )
 
     @property
     def over_s(self) -> float:
@@ -139,9 +125,10 @@ class Puppet:
         self._gain = np.where(stiff, 0.0, gaze.neck_gain)
         # Commands since the last tick: a face (58,), its channels, seconds; or a direction (2,), None, seconds.
         self._asked: deque[tuple[Doubles, Bools | None, float]] = deque()
-        shown = Request.none(MOTION_DIM, RISE_S, FALL_S, CHANGE_S, smooth=False)
-        eyes, head = Request.none(2, EYES_S, FALL_S, EYES_S), Request.none(2, HEAD_S, HEAD_S, HEAD_S)
-        self._pieces = [_Piece(_NEVER_S, shown, eyes, head)]
+        shown = Request(rise_s=RISE_S, fall_s=FALL_S, change_s=CHANGE_S, smooth=False)
+        eyes = Request(rise_s=EYES_S, fall_s=FALL_S, change_s=EYES_S)
+        head = Request(rise_s=HEAD_S, fall_s=HEAD_S, change_s=HEAD_S)
+        self._pieces = [_Piece(-math.inf, shown, eyes, head)]
 
     def show(self, face: Floats | Mapping[str, float], seconds: float) -> None:
         """Show a whole face (58,), or some channels by name, for `seconds` once it has risen. Never blocks.
