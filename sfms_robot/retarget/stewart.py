@@ -28,6 +28,7 @@ import numpy as np
 from sfms_robot.config.kinematics import StewartPlatform
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE_CHANNELS, Bools, Doubles
+from sfms_robot.ranges import Range
 from sfms_robot.retarget.neck import Ranges, Solved, checked, low_pass
 from sfms_robot.signals import rotations
 
@@ -159,14 +160,14 @@ class Stewart:
         self.joints: Sequence[str] = config.joints()
         self.geometry = Platform.of(config)
         self._body = config.body_yaw
-        self._low, self._high = np.array([ranges[leg.joint] for leg in config.legs]).T
+        self._range = Range(*np.array([ranges[leg.joint] for leg in config.legs]).T)
         self._body_range = ranges[self._body.joint] if self._body else (0.0, 0.0)
         limits = config.limits
         self._lean = (
             np.array([*np.radians([limits.roll_deg, limits.pitch_deg, limits.yaw_deg]), *[np.inf] * 3]) + ROUNDING_RAD
         )
         home = self.geometry.inverse(HOME, DEAD_CENTRE)
-        if not bool(((home >= self._low) & (home <= self._high)).all()):  # neither for NaN
+        if not self._range.holds(home).all():
             shown = ", ".join(
                 f"{name} {angle:.1f}" for name, angle in zip(self.joints[-6:], np.degrees(home), strict=True)
             )
@@ -180,11 +181,10 @@ class Stewart:
     def reachable(self, poses: Doubles) -> Bools:
         """Return True (n,) for the poses (n, 6), seen from the body, that the platform can take."""
         cranks = self.geometry.inverse(poses, DEAD_CENTRE)
-        inside = (cranks >= self._low) & (cranks <= self._high)  # False for NaN
-        fine = inside.all(axis=-1) & (np.abs(poses) <= self._lean).all(axis=-1)
+        fine = np.asarray(self._range.holds(cranks).all(axis=-1) & (np.abs(poses) <= self._lean).all(axis=-1))
         stiff = self.geometry.stiffness(poses[fine], cranks[fine])
         fine[fine] = stiff / self._home_stiffness >= MIN_STIFFNESS
-        return np.asarray(fine)
+        return fine
 
     def solve(self, poses: Doubles, body_yaw_rad: Doubles | None = None) -> Solved:
         """Solve poses (..., 6), see `neck.Serial.solve`."""
@@ -223,7 +223,7 @@ class Stewart:
         shape = poses.shape[:-1]
         wanted = rotations.seen_from(body, poses).reshape(-1, 6)
         given, reached = self.nearest(wanted)
-        cranks = np.clip(self.geometry.inverse(given), self._low, self._high)  # a border pose may round past its end
+        cranks = self._range.nearest(self.geometry.inverse(given))  # a border pose may round past its end
         angles = cranks.reshape(*shape, 6)
         if self.turns_body:
             angles = np.concatenate([np.broadcast_to(body, shape)[..., None], angles], axis=-1)
