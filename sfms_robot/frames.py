@@ -102,6 +102,8 @@ def clip_shapes(motion: NDArray[np.floating]) -> None:
     """Limit the blendshapes of motion (..., 58) to 0..1, in place."""
     shapes = motion[..., SHAPES]
     np.clip(shapes, 0.0, 1.0, out=shapes)
+
+
 def changed(value: Value, **fields: object) -> Value:
     """Replace fields as `dataclasses.replace`, in an eighth of its time, for values without checks.
 

@@ -159,7 +159,9 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
         stack.callback(bus.close)
         bus.connect()
         if weak := bus.statistics().get("stored_warnings"):
-            log.warning("servos protect themselves less than usual: %s; mend it: %s", "; ".join(weak), doctor)
+            log.warning(
+                "servos protect themselves otherwise than the head expects: %s; mend it: %s", "; ".join(weak), doctor
+            )
         yield OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
 
 

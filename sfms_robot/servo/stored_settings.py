@@ -11,7 +11,7 @@ memory table V3.6 (angle limits 9 and 11, phase 18, unloading condition 19, offs
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Final, Literal
 
@@ -49,7 +49,7 @@ class JointNeeds:
     stored: Mapping[str, int] = field(default_factory=dict)
     other_ids: frozenset[int] = frozenset()
     bounded_current: bool = False
-    allowed_faults: frozenset[str] = frozenset()
+    allowed_faults: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Contradiction:
 
     Attributes:
         wanted: the value that fits, as close to the stored one as possible.
-        then: `refused` at startup, `set` by startup, or `told`: a warning, since it only weakens protection.
+        then: `refused` at startup, `set` by startup, or `told`: a warning, since only the protection differs.
         fixable: it can be corrected without harm; else a person has to look at it.
         in_file: the head's file has to change, since zero and direction belong together with it; else the servo.
     """

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from virtual_time import Time
 
+from sfms_robot.config import Faults
 from sfms_robot.servo.chain.link import TRIES, RegisterLink, finish
 from sfms_robot.servo.chain.protocol1 import Dynamixel1Link, FeetechLink, Protocol1Startup
 from sfms_robot.servo.chain.protocol2 import Dynamixel2Link, Dynamixel2Startup
@@ -28,7 +29,8 @@ def startups_on(port, servos, conversion):
     """The startups of these servos over `port`, and what runs them all through."""
     table = servos[0].table
     link, kind = link_on(port, table), Dynamixel2Startup if table.protocol == 2 else Protocol1Startup
-    startups = [kind(servo, needs, {}) for servo, needs in zip(servos, needs_of(servos, conversion), strict=True)]
+    needs = needs_of(servos, conversion, Faults())
+    startups = [kind(servo, each, {}) for servo, each in zip(servos, needs, strict=True)]
     for each in startups:
         each.link = link
     return startups, lambda: start_up("face", link, startups, port.baud)

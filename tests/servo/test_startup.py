@@ -7,7 +7,7 @@ from emulated_port import LossyPort, Straight, bus_servo, startups_on, switched_
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.config import Safety, load_firmware_map
+from sfms_robot.config import Faults, Safety, load_firmware_map
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
 from sfms_robot.servo.chain.link import Silent, finish
@@ -34,7 +34,7 @@ class Rig(ServoRig):
             for i in wanted or range(1, 1 + len(there))
         ]
         conversion = Straight(self.table, ratio=ratio)
-        self.needs = needs_of(servos, conversion)
+        self.needs = needs_of(servos, conversion, Faults())
         self.startups, self.start_up = startups_on(self.port, servos, conversion)
 
     def held(self, name, servo=1):

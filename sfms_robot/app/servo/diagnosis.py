@@ -317,7 +317,7 @@ def _stored(state: ServoState, table: Table, want: Wanted | None, line: Line) ->
 
 
 def stored_contradictions(state: ServoState, want: Wanted | None) -> list[Contradiction]:
-    """Return the contradictions that startup would find, with the faults that the head's file says to live with."""
+    """Return the contradictions that startup would find."""
     table = state.seen.table
     if table is None or not state.values:
         return []
@@ -326,8 +326,6 @@ def stored_contradictions(state: ServoState, want: Wanted | None) -> list[Contra
     else:  # a servo that is not a joint of a head has to stay within its own limits
         low, high = (state.values.get(name, table.center_ticks) for name in limit_names(table) or ("", ""))
         needs = JointNeeds(*((low, high) if low < high else (table.center_ticks, table.center_ticks)))
-    if want is not None:
-        needs = replace(needs, allowed_faults=frozenset(want.faults.mask))
     return contradictions(state.values, table, needs)
 
 

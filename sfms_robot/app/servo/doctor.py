@@ -184,7 +184,7 @@ def _lines(
                     faults=described.faults,
                     needs=needs,
                 )
-                for servo, needs in zip(servos, needs_of(servos, calibration_of(joints)), strict=True)
+                for servo, needs in zip(servos, needs_of(servos, calibration_of(joints), described.faults), strict=True)
             },
             bus=name,
             head=head,

@@ -86,7 +86,7 @@ class ChainBus(WireBus[RegisterLink]):
         config: BusConfig | None = None,
         faults: Faults | None = None,
     ) -> None:
-        config = config or BusConfig(family="dynamixel2", baud=baud)
+        config, faults = config or BusConfig(family="dynamixel2", baud=baud), faults or Faults()
         self._config = config.model_copy(update={"baud": baud, "read_deadline_ms": read_deadline_s * 1e3})
         super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
         self._ids = np.array([servo.id for servo in servos])
@@ -96,12 +96,10 @@ class ChainBus(WireBus[RegisterLink]):
         self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
         self._startups = [
             self.startup(servo, needs, self._warnings, self._coming_back)
-            for servo, needs in zip(servos, needs_of(servos, conversion), strict=True)
+            for servo, needs in zip(servos, needs_of(servos, conversion, faults), strict=True)
         ]
         self._notices = Notices(name, len(servos))
-        self._members = [
-            Member(i, each, faults or Faults(), self._faults, self._notices) for i, each in enumerate(self._startups)
-        ]
+        self._members = [Member(i, each, faults, self._faults, self._notices) for i, each in enumerate(self._startups)]
         self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.link.framing)
         self._settings = Settings(self._members, self._telemetry.torque, self._poll)
         self._enabled = False

@@ -34,6 +34,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import ClassVar, Final, NamedTuple
 
+from sfms_robot.config import Faults
 from sfms_robot.errors import NOTE, BusError, ServoError
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.bus import tick_ranges
@@ -439,8 +440,8 @@ def start_up(bus: str, link: RegisterLink, startups: Sequence[Startup], baud: in
     return bits
 
 
-def needs_of(servos: Sequence[BusServo], conversion: TickConversion) -> list[JointNeeds]:
-    """Return what each joint of a bus requires of its servo."""
+def needs_of(servos: Sequence[BusServo], conversion: TickConversion, faults: Faults) -> list[JointNeeds]:
+    """Return what each joint of a bus requires of its servo; `faults`: those that the head acts upon."""
     ids = frozenset(servo.id for servo in servos)
     return [
         JointNeeds(
@@ -449,6 +450,7 @@ def needs_of(servos: Sequence[BusServo], conversion: TickConversion) -> list[Joi
             stored=servo.safety.stored,
             other_ids=ids - {servo.id},
             bounded_current=servo.safety.current_limit_mA is not None,
+            allowed_faults=faults.mask,
         )
         for servo, low, high in zip(servos, *tick_ranges(servos, conversion).tolist(), strict=True)
     ]
