@@ -418,9 +418,7 @@ def plugged(
 
 def _wire(description: Mapping[str, Any]) -> EmulatedWire:
     """Return the wire with its servos and faults."""
-    tables = {name: Table.from_plain(plain) for name, plain in description["tables"].items()}
-    servos = [EmulatedServo(**row) for row in description["servos"]]
-    devices = plugged(servos, tables, description["behind_silent"] != "skip")
+    devices = plugged(description["servos"], description["tables"], description["behind_silent"] != "skip")
     faults = [parse_fault(text) for text in description["faults"]]
     return EmulatedWire(devices, description["timing"], faults, description["seed"])
 
@@ -429,7 +427,7 @@ def _bound(description: Mapping[str, Any], folder: str) -> tuple[socket.socket, 
     """Return the control socket, its address, and the function that opens the device."""
     if description["transport"] == "tcp":
         control = socket.create_server((LOOPBACK, 0))
-        return control, f"{LOOPBACK}:{control.getsockname()[1]}", partial(NetworkPort, description["servos"][0]["baud"])
+        return control, f"{LOOPBACK}:{control.getsockname()[1]}", partial(NetworkPort, description["servos"][0].baud)
     control, place = socket.socket(socket.AF_UNIX), os.path.join(folder, "control")
     control.bind(place)
     link = description["link"] or os.path.join(folder, "device")

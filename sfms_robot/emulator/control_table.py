@@ -33,6 +33,7 @@ from typing import Final
 from sfms_robot.emulator.plant import MotorCommand
 from sfms_robot.servo.registers import Field, Table
 
+_WHOLE_SPACE: Final = 256
 _WINDOW: Final = "indirect_data_"
 _CACHED: Final = 1024  # blocks whose registers are remembered: a host that sends noise must not fill the memory
 _REVERSE, _PROFILE_BY_TIME, TORQUE_ON_BY_GOAL = 0x01, 0x04, 0x08  # drive mode (10), bits 0, 2 and 3
@@ -55,13 +56,12 @@ class ControlTable:
     An indirect data register is a window: byte k of the block shows the byte whose address stands in
     `indirect_address_k`. The firmware map says where the block lies (X330 servos up to firmware 52 have it elsewhere).
 
-    Args:
-        size: Bytes that can be read; the whole table by default.
+    A Feetech answers a read of any address.
     """
 
-    def __init__(self, table: Table, size: int | None = None) -> None:
+    def __init__(self, table: Table) -> None:
         self.table = table
-        self.raw = bytearray(size or table.size)
+        self.raw = bytearray(_WHOLE_SPACE if table.family == "feetech" else table.size)
         fields = table.fields
         self._named = {role: field for role in table.roles if (field := table.role(role))} | dict(fields)
         self._ranges = {name: _value_range(field) for name, field in self._named.items()}

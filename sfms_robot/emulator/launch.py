@@ -17,7 +17,7 @@ import shutil
 import sys
 import threading
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from typing import Any, Final, Literal, Self, cast
@@ -27,6 +27,7 @@ from sfms_robot.emulator.emulated_wire import EmulatedServo, Timing
 from sfms_robot.endpoint import connect
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.processes import Child
+from sfms_robot.servo.registers import Table
 
 __all__ = ["BehindSilent", "Chain", "EmulatedServo", "Timing", "launch", "wait"]
 
@@ -224,8 +225,8 @@ def launch(
         "faults": list(faults),
         "seed": seed,
         "link": link and os.path.abspath(link),
-        "tables": {model: each.model_dump(mode="json") for model, each in {each.model: each for each in maps}.items()},
-        "servos": [asdict(servo) | {"model": each.model} for servo, each in zip(servos, maps, strict=True)],
+        "tables": {each.model: Table.of(each) for each in maps},
+        "servos": [replace(servo, model=each.model) for servo, each in zip(servos, maps, strict=True)],
     }
     child = Child("sfms_robot.emulator.chain_process:main", description, name="emulator")
     answer = child.receive(_START_S)

@@ -44,7 +44,6 @@ _CHECK_S: Final = 0.1  # between two looks of the firmware at the load and the t
 _DELAY_TICK_S: Final = 2e-6  # of the return delay
 _BROWN_OUT: Final = 0.7  # of the lowest supply it allows: below that the controller itself stops
 _BAUD_TOLERANCE: Final = 0.03  # what a UART forgives
-_WHOLE_SPACE: Final = 256  # a Feetech answers a read of any address
 _FULL_TORQUE: Final = 1000
 _NEAR_TICKS: Final = 8.0  # of its goal: a Dynamixel 2.0 reports "in position"
 USUAL_BITS: Final = {"voltage": 0x01, "overheating": 0x04, "overload": 0x20}  # where the firmware map names none
@@ -75,6 +74,7 @@ class RegisterServo(ABC):
         mute: It obeys, and never answers.
         fault_status: Bits of its faults, as the firmware map numbers them.
         plant: The motor; its ticks are those of the shaft.
+        fault_bits: Bit of the voltage, overheating and overload fault, by name.
         id, second_id, baud, return_delay_s, torque: As the registers say now.
     """
 
@@ -85,7 +85,7 @@ class RegisterServo(ABC):
         self.firmware = what.firmware
         self.drive: MotorCommand | None = None
         self._is_feetech = table.family == "feetech"
-        self._memory = ControlTable(table, _WHOLE_SPACE if self._is_feetech else None)
+        self._memory = ControlTable(table)
         self._get, self._put = self._memory.get, self._memory.put
         self._registered: tuple[int, bytes] | None = None
         self._powered, self._tripped = True, False
@@ -98,7 +98,7 @@ class RegisterServo(ABC):
         current = table.role("present_current")
         self._current_scale = current.scale or 1.0 if current else 1.0
         named = table.servo_faults.items()
-        self._bits = USUAL_BITS | {name: 1 << bit for bit, text in named for name in USUAL_BITS if name in text}
+        self.fault_bits = USUAL_BITS | {name: 1 << bit for bit, text in named for name in USUAL_BITS if name in text}
         self._reset_registers()
         self._put("id", what.id)
         self._put("baud_rate", next(code for code, rate in table.baud_codes.items() if rate == what.baud))
@@ -252,10 +252,6 @@ class RegisterServo(ABC):
         self.advance(now_s)
         self._fail(bits)
 
-    def fail_named(self, fault: str, now_s: float) -> None:
-        """Set a fault by name: overheating, overload."""
-        self.fail(self._bits[fault], now_s)
-
     def set_supply(self, volts: float, now_s: float) -> None:
         """Change the supply. Too low stops the controller, which restarts when the supply is back."""
         self.advance(now_s)
@@ -276,13 +272,12 @@ class RegisterServo(ABC):
     def state(self, now_s: float) -> dict[str, Any]:
         """Return what a look at the servo shows, whatever is on the wire."""
         self.advance(now_s)
-        names = self.table.fault_names if self.table.protocol == 2 else self.table.status_fault_names
         return {
             "position": self.frame.reported(self.plant.position),
             "speed": self.frame.sign * self.plant.speed,
             "goal": self._get("goal_position"),
             "torque": self._powered and self.torque == 1,
-            "faults": names(self.fault_status),
+            "faults": ", ".join(self.table.faults_in(self.fault_status)),
             "temperature_C": self.plant.temperature_C,
         }
 
@@ -381,17 +376,17 @@ class RegisterServo(ABC):
         self._settings()
 
     def _watch_motor(self) -> None:
-        if self.plant.overloaded and not self.fault_status & self._bits["overload"]:
-            self._fail(self._bits["overload"])
+        if self.plant.overloaded and not self.fault_status & self.fault_bits["overload"]:
+            self._fail(self.fault_bits["overload"])
         if 0 < self._hottest_C < self.plant.temperature_C:
-            self._fail(self._bits["overheating"])
+            self._fail(self.fault_bits["overheating"])
 
     def _watch_supply(self) -> None:
         low, high = self._volts("min_voltage_limit"), self._volts("max_voltage_limit")
         if self._powered and high and not low <= self.supply_v <= high:
-            self._fail(self._bits["voltage"])
+            self._fail(self.fault_bits["voltage"])
         elif self.table.protocol == 1:
-            self.fault_status &= ~self._bits["voltage"]
+            self.fault_status &= ~self.fault_bits["voltage"]
 
     def _power_up(self) -> None:
         for field in self.table.fields.values():

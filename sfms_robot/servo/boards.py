@@ -184,7 +184,7 @@ class Maestro:
         bits = int.from_bytes(answer, "little")
         if len(answer) != self.status_length or bits >> (max(self._table.faults, default=15) + 1):
             return None
-        return BoardStatus(self._table.fault_names(bits), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
+        return BoardStatus(", ".join(self._table.faults_in(bits)), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
 
     def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
         """Return what moves channels to `ticks`; the goals before were sent `interval_s` ago, 0 for the first."""

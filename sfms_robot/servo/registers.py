@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 if TYPE_CHECKING:
     from sfms_robot.config import FirmwareMap
@@ -21,7 +21,7 @@ ASSUMED_SPEED_DEG_S = 300.0  # no-load speed if the maker states none: only an e
 ByteOrder = Literal["little", "big"]
 
 _ACCELERATIONS: Final = ("profile_acceleration", "goal_acceleration", "acceleration")
-_FROM_ROW = ("address", "size", "access", "area", "unit", "scale", "low", "high", "signed")
+_FROM_ROW: Final = {"address", "size", "access", "area", "unit", "scale", "low", "high", "signed"}
 
 
 class Field(NamedTuple):
@@ -122,32 +122,23 @@ class Table:
     @classmethod
     def of(cls, firmware_map: FirmwareMap) -> Table:
         """Return the table of a firmware map."""
-        return cls.from_plain(firmware_map.model_dump(mode="json"))
-
-    @classmethod
-    def from_plain(cls, plain: Mapping[str, Any]) -> Table:
-        """Return the table of a validated firmware map as plain data, perhaps from JSON (which makes keys text)."""
-        speed, pulse = plain["no_load_speed_deg_s"] or ASSUMED_SPEED_DEG_S, plain["pulse_us"]
-        unchanged = {name: plain[name] for name in cls.__dataclass_fields__ if name in plain}
+        speed, pulse = firmware_map.no_load_speed_deg_s or ASSUMED_SPEED_DEG_S, firmware_map.pulse_us
+        unchanged = firmware_map.model_dump(include=set(cls.__dataclass_fields__))
         converted = {
             "fields": {
                 name: Field(
                     name=name,
-                    byte_order=plain["byte_order"],
-                    initial=row["initial"] or 0,
-                    **{key: row[key] for key in _FROM_ROW},
+                    byte_order=firmware_map.byte_order,
+                    initial=row.initial or 0,
+                    **row.model_dump(include=_FROM_ROW),
                 )
-                for name, row in plain["registers"].items()
+                for name, row in firmware_map.registers.items()
             },
-            "top_speed_ticks_s": speed * (plain["ticks_per_revolution"] / 360.0),
-            "firmware": (plain["firmware"]["min"], plain["firmware"]["max"]),
-            "pulse_us": (pulse["min"], pulse["max"]) if pulse else None,
+            "top_speed_ticks_s": speed * (firmware_map.ticks_per_revolution / 360.0),
+            "firmware": (firmware_map.firmware.min, firmware_map.firmware.max),
+            "pulse_us": (pulse.min, pulse.max) if pulse else None,
         }
-        by_number = {
-            name: {int(key): value for key, value in plain[name].items()}
-            for name in ("baud_codes", "faults", "status_faults")
-        }
-        return cls(**(unchanged | converted | by_number))
+        return cls(**unchanged | converted)
 
     def __getitem__(self, name: str) -> Field:
         return self.fields[name]
@@ -175,17 +166,16 @@ class Table:
 
     @property
     def servo_faults(self) -> Mapping[int, str]:
-        """Return bit -> fault of the servo: of its error status (Protocol 2.0), or of every status packet."""
-        return self.faults if self.protocol == 2 else self.status_faults
+        """Return bit -> fault: of every status packet (protocol 1), else of role `error_status` or the error word."""
+        return self.status_faults if self.protocol == 1 else self.faults
 
-    def fault_names(self, status: int) -> str:
-        """Return the faults in a value of role `error_status`, in words; empty for 0."""
-        bits = [bit for bit in range(16) if status >> bit & 1]
-        return ", ".join(self.faults.get(bit, f"hardware error bit {bit}") for bit in bits)
+    def faults_in(self, status: int) -> list[str]:
+        """Return the faults in a value whose bits are those of `servo_faults`, in words.
 
-    def status_fault_names(self, error: int) -> str:
-        """Return the servo's faults in the error byte of a status packet, in words, without bits about the packet."""
-        return ", ".join(text for bit, text in sorted(self.status_faults.items()) if error >> bit & 1)
+        Other bits of a status packet are about the request, and are left out.
+        """
+        names, bits = self.servo_faults, [bit for bit in range(16) if status >> bit & 1]
+        return [names.get(bit, f"hardware error bit {bit}") for bit in bits if bit in names or self.protocol != 1]
 
 
 def span_of(fields: Sequence[Field]) -> tuple[int, int]:

@@ -127,8 +127,8 @@ class ServoState:
         table = self.seen.table
         if table is None:
             return ""
-        named = table.fault_names(self.value("error_status") or 0) or table.status_fault_names(self.error)
-        return named or ("hardware error" if table.protocol == 2 and self.error & ALERT else "")
+        named = table.faults_in(self.error if table.protocol == 1 else self.value("error_status") or 0)
+        return ", ".join(named) or ("hardware error" if table.protocol == 2 and self.error & ALERT else "")
 
     def torque(self) -> bool | None:
         """Return whether torque is on; None when it was not read."""

@@ -303,9 +303,8 @@ class Member:
         if not bits and not self._bits:
             return
         self._bits = bits
-        texts = self.startup.table.servo_faults
         names = []
-        for name in (texts.get(bit, f"hardware error bit {bit}") for bit in range(8) if bits >> bit & 1):
+        for name in self.startup.table.faults_in(bits):
             if counts(name, self._faults, measured):
                 names.append(name)
             elif name not in self._ignored:

@@ -65,13 +65,12 @@ class Protocol1Link(RegisterLink):
 
     def ping(self, servo: int) -> Found | None:
         """Ping a servo and read its identity, which this protocol's ping does not report."""
-        if self._ask(servo, protocol1.PING, b"", 0) is None:
-            if not self._echoed:
-                return None
-            # With only the voltage bit set, an answer to a ping has the bytes of the ping: it looks like an echo.
-            who = self._who(servo)
-            return None if who.model_number is None else who
-        return self._who(servo)
+        if self._ask(servo, protocol1.PING, b"", 0) is not None:
+            return self._who(servo)
+        # With only the voltage bit set, an answer to a ping has the bytes of the ping: it looks like an echo.
+        if self._echoed and (who := self._who(servo)).model_number is not None:
+            return who
+        return None
 
     def read(self, servo: int, address: int, length: int) -> Answer | None:
         return self._ask(servo, protocol1.READ, bytes([address, length]), length)
@@ -296,7 +295,7 @@ class Protocol1Startup(Startup):
         except ServoError as error:
             torque = self._field("torque_enable")
             answer = self.link.read(self.servo.id, torque.address, torque.size)
-            fault = "" if answer is None else self.table.status_fault_names(answer.error)
+            fault = "" if answer is None else ", ".join(self.table.faults_in(answer.error))
             raise ServoError(f"{error}, and it reports a hardware error ({fault})" if fault else str(error)) from None
 
 
