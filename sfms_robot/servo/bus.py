@@ -35,7 +35,6 @@ L = TypeVar("L", bound=Link)
 log = logging.getLogger(__name__)
 
 REOPEN_S: Final = 0.2  # between two tries to open a lost port
-RECONNECT_S: Final = BusConfig.model_fields["reconnect_s"].default
 COUNTS: Final = ("writes", "reads", "errors", "retries", "reconnects")  # of the statistics of every bus
 LEFT_OUT: Final = "left out"  # fault of a joint without a servo in this run
 _SLACK_RAD: Final = 1e-9
@@ -125,7 +124,7 @@ class WireBus(ABC, Generic[L]):
         open_port: opens the port at `baud`, again after the device was gone; the bus owns what it returns.
         baud: bits per second.
         read_deadline_s: time without a byte after which a servo, or a board, counts as silent.
-        reconnect_s: time without any answer after which the bus has failed.
+        config: the bus in the head's file.
     """
 
     def __init__(
@@ -136,7 +135,7 @@ class WireBus(ABC, Generic[L]):
         open_port: Callable[[], Port],
         baud: int,
         read_deadline_s: float,
-        reconnect_s: float = RECONNECT_S,
+        config: BusConfig,
     ) -> None:
         self.name = name
         self.joints = tuple(servo.joint for servo in servos)
@@ -146,7 +145,8 @@ class WireBus(ABC, Generic[L]):
         self._open_port = open_port
         self._baud = baud
         self._read_deadline_s = read_deadline_s
-        self._reconnect_s = reconnect_s
+        self._config = config
+        self._reconnect_s = config.reconnect_s  # time without any answer after which the bus has failed
         self._counts = dict.fromkeys(COUNTS, 0)
         self._link: L | None = None
         self._powered: frozenset[int] = frozenset()  # ids whose torque came on and is not confirmed off

@@ -37,7 +37,7 @@ from sfms_robot.servo.boards import (
     board_problem,
     pulses_beyond,
 )
-from sfms_robot.servo.bus import RECONNECT_S, WireBus
+from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
 
@@ -58,13 +58,12 @@ class PulseBus(WireBus[RateLimitedPort]):
     """A Pololu Maestro or a Lynxmotion SSC-32, as `ports.Bus`.
 
     Args:
-        name, open_port, baud: see `WireBus`.
+        name, open_port, baud, config: see `WireBus`.
         servos: in joint order; `id` is the channel.
         conversion: joint angles (J,) <-> ticks (J,) of pulse width.
         read_deadline_s: time without an answer after which a request counts as unanswered; at least 20 ms.
         confirmed: the user knows that servos jump when their pulses come on.
         rest_rad: (J,) first goals without a better one; by default 0 rad, or the end of the range nearest to it.
-        config: the bus in the head's file.
 
     Raises ConfigError for a channel or a pulse that the board does not have.
     """
@@ -76,21 +75,20 @@ class PulseBus(WireBus[RateLimitedPort]):
         conversion: TickConversion,
         open_port: Callable[[], Port],
         baud: int,
-        read_deadline_s: float = _LEAST_PATIENCE_S,
+        read_deadline_s: float,
+        config: BusConfig,
         *,
         confirmed: bool = False,
         rest_rad: Doubles | None = None,
-        config: BusConfig | None = None,
     ) -> None:
-        reconnect_s = config.reconnect_s if config is not None else RECONNECT_S
-        patience_s, reconnect_s = max(read_deadline_s, _LEAST_PATIENCE_S), max(reconnect_s, _LEAST_RECONNECT_S)
-        super().__init__(name, servos, conversion, open_port, baud, patience_s, reconnect_s)
+        patience_s = max(read_deadline_s, _LEAST_PATIENCE_S)
+        super().__init__(name, servos, conversion, open_port, baud, patience_s, config)
+        self._reconnect_s = max(config.reconnect_s, _LEAST_RECONNECT_S)
         self.capabilities = dict.fromkeys(self.joints, _CAPABILITIES)
         self._confirmed = confirmed
         table = board_of(name, servos)
         self.model = table.model
-        crc = config is not None and config.crc
-        self._table, self._board = table, board_for(table, crc)
+        self._table, self._board = table, board_for(table, config.crc)
         if beyond := pulses_beyond(servos, conversion, table, table.pulse_us):
             raise ConfigError(f"bus {name!r}: a {self.model} does not make the pulses of {beyond}")
         if wide := pulses_beyond(servos, conversion, table, self._board.factory_us):

@@ -39,7 +39,7 @@ class Bench:
 
         config = BusConfig(family=firmware_map.family, baud=baud, crc=crc[0])
         conversion, more = Straight(firmware_map, limit_rad), {"confirmed": True, "config": config} | more
-        self.bus = family_named(firmware_map.family).build("face", servos, conversion, open_port, baud, **more)
+        self.bus = family_named(firmware_map.family).build("face", servos, conversion, open_port, baud, 0.0, **more)
 
     def new_port(self, *rest):
         return EmulatedPort(*rest)

@@ -37,7 +37,8 @@ def bus_of(
     name, family = next((name, each) for name, each in families().items() if each.maps == of)
     conversion = conversion or Straight(maps[0], limit_rad)
     options = BusConfig(family=name, baud=baud, **config)
-    more = {"confirmed": True} if family.board else {"faults": faults}  # hobby servos jump to their first pose
+    # Hobby servos jump to their first pose.
+    more = {"confirmed": True} if family.board else {"faults": faults or Faults()}
     return family.build("face", servos, conversion, open_port, baud, read_deadline_s, config=options, **more)
 
 

@@ -6,7 +6,7 @@ import pytest
 from board_rig import LIMIT_RAD, Bench
 from emulated_port import EmulatedPort, Straight, bus_servo
 
-from sfms_robot.config import load_firmware_map
+from sfms_robot.config import BusConfig, load_firmware_map
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.servo.codecs import maestro
@@ -219,7 +219,8 @@ def test_two_boards_on_one_bus_are_refused():
     six, all_ = load_firmware_map("maestro-6"), load_firmware_map("maestro-24")
     servos = [bus_servo("a", 0, six, 0.1), bus_servo("b", 1, all_, 0.1)]
     with pytest.raises(ConfigError, match="one board is one model, the head says maestro-6 and maestro-24"):
-        PulseBus("face", servos, Straight(six), lambda: EmulatedPort(None), 115200)
+        config = BusConfig(family="maestro", baud=115200)
+        PulseBus("face", servos, Straight(six), lambda: EmulatedPort(None), 115200, 0.0, config)
 
 
 @pytest.mark.parametrize(

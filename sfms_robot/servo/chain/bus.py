@@ -43,7 +43,6 @@ from sfms_robot.servo.registers import Field
 
 log = logging.getLogger(__name__)
 
-READ_DEADLINE_S: Final = 0.003  # the time that a silent servo takes, once
 _CONFIRM_S: Final = 0.35  # that `stop` waits for servos to confirm, at most
 _ROUNDS: Final = 20  # of asking them; each takes a mute servo's patience
 _STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
@@ -59,9 +58,8 @@ class ChainBus(WireBus[RegisterLink]):
 
     Args:
         name, servos, conversion, open_port, baud: see `WireBus`.
-        read_deadline_s: time without a byte after which a servo counts as silent. The default suits a wire; a simulated
-            one on a busy computer needs more.
-        config: rate, watchdog and the like; by default those of a head that does not set them.
+        read_deadline_s: time without a byte after which a servo counts as silent.
+        config: rate, watchdog and the like; `baud` and `read_deadline_s` are in force in place of its own.
         faults: which faults are acted upon.
 
     Attributes:
@@ -82,13 +80,12 @@ class ChainBus(WireBus[RegisterLink]):
         conversion: TickConversion,
         open_port: Callable[[], Port],
         baud: int,
-        read_deadline_s: float = READ_DEADLINE_S,
-        config: BusConfig | None = None,
-        faults: Faults | None = None,
+        read_deadline_s: float,
+        config: BusConfig,
+        faults: Faults,
     ) -> None:
-        config, faults = config or BusConfig(family="dynamixel2", baud=baud), faults or Faults()
-        self._config = config.model_copy(update={"baud": baud, "read_deadline_ms": read_deadline_s * 1e3})
-        super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, self._config.reconnect_s)
+        config = config.model_copy(update={"baud": baud, "read_deadline_ms": read_deadline_s * 1e3})
+        super().__init__(name, servos, conversion, open_port, baud, read_deadline_s, config)
         self._ids = np.array([servo.id for servo in servos])
         self._telemetry = Telemetry(name, *self.maps, [servo.table for servo in servos], conversion)
         self.capabilities = {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
@@ -100,7 +97,7 @@ class ChainBus(WireBus[RegisterLink]):
         ]
         self._notices = Notices(name, len(servos))
         self._members = [Member(i, each, faults, self._faults, self._notices) for i, each in enumerate(self._startups)]
-        self._poll = StatusPoll(name, self._members, self._telemetry, self._config, self._counts, self.link.framing)
+        self._poll = StatusPoll(name, self._members, self._telemetry, config, self._counts, self.link.framing)
         self._settings = Settings(self._members, self._telemetry.torque, self._poll)
         self._enabled = False
         self._places: Indices = _NO_PLACES  # members that get goals
@@ -118,7 +115,7 @@ class ChainBus(WireBus[RegisterLink]):
         simple = self.maps[1] == 2 and goal.signed in ("no", "twos_complement")
         kind = f"<{'u' if goal.signed == 'no' else 'i'}{goal.size}"
         self._goal_type = np.dtype([("id", np.uint8), ("goal", kind)]) if simple else None
-        self._watchdog = math.ceil(self._config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
+        self._watchdog = math.ceil(config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf
         self._fed: Indices | None = None  # places whose watchdogs are armed
 
