@@ -31,8 +31,6 @@ _TAKERS: Final = {  # daemons that look for their own devices on every USB port
 _NO_UART: Final = "0"  # /sys/class/tty/ttyS0/type, PORT_UNKNOWN: the name is there, the hardware is not
 _NAMED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*=")  # a bus and its device; addresses and paths do not begin so
 
-Probe = Callable[[str, str], bool]  # bus, device -> do servos of that bus answer there?
-
 
 @dataclass(frozen=True)
 class SerialDevice:
@@ -318,26 +316,18 @@ def parse_ports(buses: Collection[str], text: str) -> dict[str, str]:
     return devices
 
 
-def choose_ports(buses: Collection[str], ports: Sequence[SerialDevice], probe: Probe | None = None) -> dict[str, str]:
-    """Return for `--port auto` the one device that each bus can be on, among the USB adapters of `ports`.
+def choose_ports(buses: Collection[str], ports: Sequence[SerialDevice]) -> dict[str, str]:
+    """Return for `--port auto` the one USB adapter of `ports` as the device of the one bus.
 
-    With one adapter and one bus no request is made. Otherwise `probe` asks each adapter for the servos of each bus,
-    and blocks for as long as that takes. Raises PortError without an adapter, and ConfigError naming the adapters if
-    there is a choice.
+    Raises PortError without an adapter, and ConfigError naming the adapters if there is a choice.
     """
     adapters = [port.path for port in ports if port.vendor is not None]
     if not adapters:
         raise PortError("--port auto: no USB serial adapter is plugged in (sfms-robot port list shows every port)")
     if len(buses) == len(adapters) == 1:
         return dict.fromkeys(buses, adapters[0])
-    chosen: dict[str, str] = {}
-    for bus in buses:
-        answering = [device for device in adapters if probe is None or probe(bus, device)]
-        if len(answering) != 1 or answering[0] in chosen.values():
-            found = f"{len(answering)} adapters may be" if answering else "no adapter has the servos of"
-            raise ConfigError(f"--port auto: {found} bus {bus} ({', '.join(answering or adapters)}); name one")
-        chosen[bus] = answering[0]
-    return chosen
+    found = f"{len(adapters)} adapters may be bus {' or '.join(buses)}"
+    raise ConfigError(f"--port auto: {found} ({', '.join(adapters)}); name one")
 
 
 def _wrong(text: str, problem: str, buses: Collection[str]) -> ConfigError:
