@@ -14,12 +14,11 @@ from sfms_robot.app.options import SIM
 from sfms_robot.config import BusConfig, Head, Joint, load_firmware_map
 from sfms_robot.config.head import StoredRegisters, load_stored
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
-from sfms_robot.endpoint import connect
-from sfms_robot.errors import ConfigError, PortError
+from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import AUTO, choose_ports, list_ports, parse_ports, stable_name
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort
+from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort, emulator_control
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 
@@ -72,10 +71,7 @@ class EmulatedPort(SerialPort):
         self._written = self._got = 0
         self._settled = True  # the emulator has confirmed that nothing is to come
         self._owed = 0  # answers of the emulator that have not come
-        try:
-            self._control = connect(control)
-        except OSError as error:
-            raise PortError(f"{control}: no emulator answers there: {error}") from error
+        self._control = emulator_control(control)
         self._ask()  # it counts bytes from here on
         try:
             super().__init__(device, baud, clock)

@@ -99,9 +99,7 @@ class EmulatedWire:
         hung: The adapter is unplugged; the server closes the terminal meanwhile.
     """
 
-    def __init__(
-        self, devices: Sequence[EmulatedDevice], timing: Timing = "instant", faults: Iterable[Fault] = (), seed: int = 0
-    ) -> None:
+    def __init__(self, devices: Sequence[EmulatedDevice], timing: Timing, faults: Iterable[Fault], seed: int) -> None:
         self.hung = False
         self._devices = list(devices)
         self._on_the_wire = timing == "wire"
@@ -142,7 +140,7 @@ class EmulatedWire:
         if self.hung:
             return
         through_s = self._occupy(now_s, len(data), baud)
-        if self.faults.echoes(now_s):
+        if self.faults.strikes("echo", now_s):
             self._post(Reply((), data), through_s, 0.0)
         for spoilt, late_s in self.faults.spoil((), data, now_s, TO_SERVOS):
             # Bytes do not overtake one another.
@@ -270,7 +268,7 @@ class EmulatedWire:
                 servo.advance(now_s)
                 setattr(servo.plant, kind, began if kind == "stuck" else fault.value * began)
             elif kind in ("overload", "overheat") and began:
-                servo.fail_named("overheating" if kind == "overheat" else kind, now_s)
+                servo.fail(servo.fault_bits["overheating" if kind == "overheat" else kind], now_s)
         if kind == "brownout":
             for device in self._devices:
                 device.restart(now_s)  # a board without a supply makes no pulses either

@@ -12,12 +12,12 @@ another.
 
 from __future__ import annotations
 
-import heapq
 import math
 import random
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 from sfms_robot.endpoint import whole_number
@@ -131,29 +131,21 @@ def parse_ids(text: str) -> list[int]:
 class WireFaults:
     """The faults of one wire, and their random numbers."""
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
         self._faults: list[Fault] = []
-        self._edges: list[tuple[float, int, bool, Fault]] = []
-        self._count = 0
+        self._edges: list[tuple[float, Fault, bool]] = []  # (time, fault, it begins), in the order of their times
 
     def add(self, fault: Fault) -> None:
         """Add a fault."""
         self._faults.append(fault)
-        self._add_edge(fault.start_s, True, fault)
-        self._add_edge(fault.end_s, False, fault)
-
-    def _add_edge(self, time_s: float, began: bool, fault: Fault) -> None:
-        if time_s < math.inf:
-            self._count += 1
-            heapq.heappush(self._edges, (time_s, self._count, began, fault))
+        self._edges += [(fault.start_s, fault, True), (fault.end_s, fault, False)]
+        self._edges.sort(key=itemgetter(0))
 
     def clear(self, now_s: float) -> None:
         """Remove all faults. Those that have begun end at `now_s`."""
-        begun = [fault for fault in self._faults if fault.start_s <= now_s < fault.end_s]
-        self._faults, self._edges = [], []
-        for fault in begun:
-            self._add_edge(now_s, False, fault)
+        self._edges = [(now_s, fault, False) for fault in self._faults if fault.start_s <= now_s < fault.end_s]
+        self._faults = []
 
     def texts(self, now_s: float) -> list[str]:
         """Return the specs of faults that last or are to come."""
@@ -166,8 +158,8 @@ class WireFaults:
 
     def edges(self, now_s: float) -> Iterator[tuple[float, Fault, bool]]:
         """Yield (time, fault, it begins) of all that began or ended by now, once each, in order."""
-        while self._edges and self._edges[0][0] <= now_s:
-            time_s, _, began, fault = heapq.heappop(self._edges)
+        while self.next_s <= now_s:
+            time_s, fault, began = self._edges.pop(0)
             if not began and fault in self._faults:
                 self._faults.remove(fault)
             yield time_s, fault, began
@@ -188,16 +180,13 @@ class WireFaults:
                 out = [(spoilt, late_s) for each, late_s in out for spoilt in _SPOILERS[kind](each, self._random)]
         return out
 
-    def echoes(self, now_s: float) -> bool:
-        """Return whether the adapter sends the host its own request back."""
-        return any(self._random.random() < f.value for f in self._faults if f.kind == "echo" and f.meets((), now_s))
+    def strikes(self, kind: str, now_s: float) -> bool:
+        """Return whether a fault of the adapter happens at this request: echo, noise."""
+        return any(self._random.random() < f.value for f in self._faults if f.kind == kind and f.meets((), now_s))
 
     def noise(self, now_s: float) -> bytes:
         """Return bytes of noise that follow a request."""
-        for fault in self._faults:
-            if fault.kind == "noise" and fault.meets((), now_s) and self._random.random() < fault.value:
-                return self._random.randbytes(self._random.randint(1, 12))
-        return b""
+        return self._random.randbytes(self._random.randint(1, 12)) if self.strikes("noise", now_s) else b""
 
 
 def _corrupted(data: bytes, dice: random.Random) -> list[bytes]:

@@ -55,33 +55,26 @@ def renumbered(packet: bytes, number: int) -> bytes:
 
 
 class EmulatedPhone:
-    """A sender of packets; packet i is due at i / rate_hz.
+    """A sender of the packets that ship; packet i is due at i / `RATE_HZ`.
 
-    A recording is played to its end and back without end, with increasing numbers. The caller gives the time.
+    The recording is played to its end and back without end, with increasing numbers. The caller gives the time.
     """
 
-    def __init__(
-        self,
-        host: str = "127.0.0.1",
-        port: int = PORT,
-        packets: Sequence[bytes] | None = None,
-        rate_hz: float = RATE_HZ,
-    ) -> None:
+    def __init__(self, host: str = LOOPBACK, port: int = PORT) -> None:
         self.sent = 0
-        self._packets = recorded_packets() if packets is None else list(packets)
-        self._rate_hz = rate_hz
+        self._packets = recorded_packets()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._target = (host, port)
 
     def packet(self, number: int) -> bytes:
         """Return packet `number` of the endless stream."""
         last = len(self._packets) - 1
-        place = number % (2 * last) if last else 0
-        return renumbered(self._packets[min(place, 2 * last - place) if last else 0], number)
+        place = number % (2 * last)
+        return renumbered(self._packets[min(place, 2 * last - place)], number)
 
     def send_until(self, now_s: float) -> int:
         """Send the packets due by `now_s`; return their number. Does not wait."""
-        due = math.floor(now_s * self._rate_hz + 1e-6) + 1
+        due = math.floor(now_s * RATE_HZ + 1e-6) + 1
         before = self.sent
         while self.sent < due:
             self._socket.sendto(self.packet(self.sent), self._target)
@@ -98,7 +91,7 @@ class EmulatedPhone:
         start_s = now_s()
         while (elapsed_s := now_s() - start_s) < duration_s:
             self.send_until(elapsed_s)
-            sleep(max(0.0, self.sent / self._rate_hz - (now_s() - start_s)))
+            sleep(max(0.0, self.sent / RATE_HZ - (now_s() - start_s)))
 
     def close(self) -> None:
         """Close the socket."""

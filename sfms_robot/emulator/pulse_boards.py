@@ -21,6 +21,7 @@ from typing import Any, Final
 
 from sfms_robot.emulator.emulated_wire import EmulatedDevice, EmulatedServo, Reply
 from sfms_robot.emulator.plant import MotorCommand, Plant
+from sfms_robot.emulator.register_servo import USUAL_BITS
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.registers import Table
 
@@ -29,11 +30,12 @@ _MICRO: Final = 6  # channels of the one Maestro without "set multiple targets"
 _MINI_SSC_NEUTRAL: Final = 127
 _MINI_SSC_STEP: Final = 15  # quarter microseconds: 476.25 us / 127
 _NEUTRAL: Final = 6000
-_FAULT_BITS: Final = {"overload": 0x20, "overheating": 0x04}  # a board has no such faults; these bits stand for them
 
 
 class Channel:
     """One output: its pulse in ticks, and the shaft of the servo behind it, which starts at `start_ticks`."""
+
+    fault_bits: Final = USUAL_BITS  # a board has no faults of servos; these bits stand for them
 
     def __init__(self, number: int, board: EmulatedBoard, start_ticks: int) -> None:
         self.id = number
@@ -66,10 +68,6 @@ class Channel:
         """Latch bits in the error word of the board."""
         self._board.fail(bits, now_s)
 
-    def fail_named(self, fault: str, now_s: float) -> None:
-        """Latch a fault by name: overheating, overload."""
-        self.fail(_FAULT_BITS[fault], now_s)
-
     def turn(self, ticks: float, now_s: float) -> None:
         """Turn the shaft by hand."""
         self.advance(now_s)
@@ -83,7 +81,7 @@ class Channel:
             "goal": self.goal if self.on else None,
             "pulse": self.pulse,
             "torque": self.on,
-            "faults": self._board.table.fault_names(self._board.errors),
+            "faults": ", ".join(self._board.table.faults_in(self._board.errors)),
         }
 
     @property
@@ -117,6 +115,7 @@ class EmulatedBoard(EmulatedDevice):
         self.servos = [channel for channel in self.channels if channel.id in starts]
         self.limits = [self._ticks(*table.pulse_us) for _ in self.channels]
         self._buffer = bytearray()
+        self._now_s = 0.0  # while it obeys
 
     def advance(self, now_s: float) -> None:
         for channel in self.channels:
@@ -137,24 +136,25 @@ class EmulatedBoard(EmulatedDevice):
     def replies(self, data: bytes, baud: int | None, now_s: float) -> list[Reply]:
         if not data or baud is None or (self.servos and all(channel.dead for channel in self.servos)):
             return []
-        answer = self._obey_all(data, baud, now_s)
+        self._now_s = now_s
+        answer = self._obey_all(data, baud)
         mute = self.servos and all(channel.mute for channel in self.servos)
         return [Reply((), answer)] if answer and not mute else []
 
     @abstractmethod
-    def _obey_all(self, data: bytes, baud: int, now_s: float) -> bytes: ...
+    def _obey_all(self, data: bytes, baud: int) -> bytes: ...
 
     def _ticks(self, shortest_us: float, longest_us: float) -> tuple[float, float]:
         tick_us = self.table.tick_us or 1.0
         return shortest_us / tick_us, longest_us / tick_us
 
-    def _send(self, channel: Channel, goal: float, now_s: float) -> None:
+    def _send(self, channel: Channel, goal: float) -> None:
         """Send a target, brought inside the limits of the channel; 0 ends the pulses."""
         shortest, longest = self.limits[channel.id]
         if goal == 0:
-            channel.off(now_s)
+            channel.off(self._now_s)
         else:
-            channel.send(min(max(goal, shortest), longest), now_s)
+            channel.send(min(max(goal, shortest), longest), self._now_s)
 
 
 class MaestroBoard(EmulatedBoard):
@@ -169,19 +169,19 @@ class MaestroBoard(EmulatedBoard):
         self.crc = any(servo.registers.get("crc") for servo in servos)
         self.limits = [self._ticks(*maestro.FACTORY_PULSE_US) for _ in self.channels]
 
-    def _obey_all(self, data: bytes, baud: int, now_s: float) -> bytes:
+    def _obey_all(self, data: bytes, baud: int) -> bytes:
         if self.baud is None:
             start = data.find(maestro.BAUD_INDICATION)
             if start < 0:
                 return b""
             self.baud, data = baud, data[start:]
         if baud != self.baud:
-            self.fail(maestro.SIGNAL_ERROR, now_s)
+            self.fail(maestro.SIGNAL_ERROR, self._now_s)
             return b""
         self._buffer += data
         out = b""
         while (command := maestro.maybe_command(self._buffer, crc=self.crc)) is not None:
-            out += self._obey(command, now_s)
+            out += self._obey(command)
         return out
 
     def restart(self, now_s: float) -> None:
@@ -198,8 +198,8 @@ class MaestroBoard(EmulatedBoard):
             if channel.on:
                 channel.off(now_s)
 
-    def _obey(self, command: maestro.MaestroCommand, now_s: float) -> bytes:
-        code, data, error = command
+    def _obey(self, command: maestro.MaestroCommand) -> bytes:
+        (code, data, error), now_s = command, self._now_s
         if error:
             self.fail(error, now_s)
         elif code == maestro.GET_ERRORS:
@@ -211,34 +211,34 @@ class MaestroBoard(EmulatedBoard):
         elif code == maestro.GO_HOME:
             self._home(now_s)
         elif code == maestro.SET_TARGETS:
-            self._targets(data, now_s)
+            self._targets(data)
         elif data[0] >= len(self.channels):
             self.fail(maestro.PROTOCOL_ERROR, now_s)
         else:
-            return self._to_channel(self.channels[data[0]], code, data[1:], now_s)
+            return self._to_channel(self.channels[data[0]], code, data[1:])
         return b""
 
-    def _to_channel(self, channel: Channel, code: int, data: bytes, now_s: float) -> bytes:
-        channel.advance(now_s)
+    def _to_channel(self, channel: Channel, code: int, data: bytes) -> bytes:
+        channel.advance(self._now_s)
         if code == maestro.GET_POSITION:
             return channel.pulse.to_bytes(2, "little")
         if code == maestro.SET_TARGET:
-            self._send(channel, maestro.from_word(data), now_s)
+            self._send(channel, maestro.from_word(data))
         elif code == maestro.MINI_SSC:
-            self._send(channel, _NEUTRAL + (data[0] - _MINI_SSC_NEUTRAL) * _MINI_SSC_STEP, now_s)
+            self._send(channel, _NEUTRAL + (data[0] - _MINI_SSC_NEUTRAL) * _MINI_SSC_STEP)
         elif code == maestro.SET_SPEED:
             channel.speed = maestro.from_word(data) * 100.0  # per 10 ms
         elif code == maestro.SET_ACCELERATION:
             channel.acceleration = maestro.from_word(data) * 1250.0  # per 10 ms per 80 ms
         return b""
 
-    def _targets(self, data: bytes, now_s: float) -> None:
+    def _targets(self, data: bytes) -> None:
         count, first = data[0], data[1]
         if len(self.channels) <= _MICRO or first + count > len(self.channels):
-            self.fail(maestro.PROTOCOL_ERROR, now_s)
+            self.fail(maestro.PROTOCOL_ERROR, self._now_s)
             return
         for i in range(count):
-            self._send(self.channels[first + i], maestro.from_word(data[2 + 2 * i : 4 + 2 * i]), now_s)
+            self._send(self.channels[first + i], maestro.from_word(data[2 + 2 * i : 4 + 2 * i]))
 
 
 class Ssc32Board(EmulatedBoard):
@@ -248,31 +248,31 @@ class Ssc32Board(EmulatedBoard):
         super().__init__(table, servos)
         self.baud = servos[0].baud
 
-    def _obey_all(self, data: bytes, baud: int, now_s: float) -> bytes:
+    def _obey_all(self, data: bytes, baud: int) -> bytes:
         if baud != self.baud:
             return b""
         self._buffer += data
         out = b""
         while (command := ssc32.maybe_command(self._buffer)) is not None:
             if isinstance(command, ssc32.Group):
-                self._group(command, now_s)
-            elif isinstance(command, ssc32.Query):
-                out += self._answer(command, now_s)
+                self._group(command)
+            else:
+                out += self._answer(command)
         return out
 
-    def _group(self, group: ssc32.Group, now_s: float) -> None:
+    def _group(self, group: ssc32.Group) -> None:
         for number, move in group.moves.items():
             channel = self.channels[number]
-            channel.advance(now_s)
+            channel.advance(self._now_s)
             gap = abs(move.pulse_us - channel.plant.reference)
             limits = (float(move.speed_us_s), gap * 1e3 / group.time_ms if group.time_ms else 0.0)
             channel.speed = min((limit for limit in limits if limit > 0.0), default=0.0)
-            self._send(channel, move.pulse_us, now_s)
+            self._send(channel, move.pulse_us)
         for number in group.levels:
-            self.channels[number].off(now_s)
+            self.channels[number].off(self._now_s)
 
-    def _answer(self, query: ssc32.Query, now_s: float) -> bytes:
-        self.advance(now_s)
+    def _answer(self, query: ssc32.Query) -> bytes:
+        self.advance(self._now_s)
         if query.kind == "Q":
             return ssc32.MOVING if any(channel.moving for channel in self.channels) else ssc32.DONE
         if query.kind == "QP":

@@ -34,7 +34,10 @@ Request = tuple[int, int, T]  # id, address, and length or data
 
 
 class ServoChain(EmulatedDevice, Generic[S]):
-    """The servos of one protocol. `tables` by model."""
+    """The servos of one protocol. `tables` by model.
+
+    While it obeys, `_now_s` is the time, and `_listening` the servos that receive the packet, by id.
+    """
 
     _servo_class: type[S]
     _width: int  # bytes of an address and of a length in the parameters of an instruction
@@ -44,38 +47,34 @@ class ServoChain(EmulatedDevice, Generic[S]):
         self.servos: list[S] = [self._servo_class(servo, tables[servo.model]) for servo in servos]
         self.chain_break = chain_break
         self._buffer = bytearray()
-        self._received_at_s = 0.0
+        self._now_s = 0.0
+        self._listening: dict[int, list[S]] = {}
 
     def replies(self, data: bytes, baud: int | None, now_s: float) -> list[Reply]:
-        if now_s - self._received_at_s > _GAP_S:
+        if now_s - self._now_s > _GAP_S:
             self._buffer.clear()
-        self._received_at_s = now_s
+        self._now_s = now_s
         self._buffer += data
-        return list(self._obey_all(baud, now_s))
+        return list(self._obey_all(baud))
 
-    def _listening(self, baud: int | None, now_s: float) -> dict[int, list[S]]:
-        """Return the servos that receive a packet now, by id; without any, the buffer holds noise of another baud."""
-        listening: dict[int, list[S]] = {}
-        for servo in self.servos:
-            if servo.hears(baud, now_s):
-                servo.feed_watchdog(now_s)
-                listening.setdefault(servo.id, []).append(servo)
-        if not listening:
-            self._buffer.clear()
-        return listening
-
-    def _obey_all(self, baud: int | None, now_s: float) -> Iterator[Reply]:
+    def _obey_all(self, baud: int | None) -> Iterator[Reply]:
         """Yield the answers to the whole packets in the buffer, which are taken out of it."""
         while (packet := self._decode(self._buffer)) is not None:
-            listening = self._listening(baud, now_s)
+            self._listening = {}
+            for servo in self.servos:
+                if servo.hears(baud, self._now_s):
+                    servo.feed_watchdog(self._now_s)
+                    self._listening.setdefault(servo.id, []).append(servo)
+            if not self._listening:
+                self._buffer.clear()  # noise of another baud
             try:
-                yield from self._answers(packet, listening, now_s)
+                yield from self._answers(packet)
             except IndexError:
                 continue  # parameters are missing: no servo knows what was meant
 
     @abstractmethod
-    def _answers(self, packet: Any, listening: dict[int, list[S]], now_s: float) -> Iterator[Reply]:
-        """Yield the answers to a packet of the servos that receive it, by id."""
+    def _answers(self, packet: Any) -> Iterator[Reply]:
+        """Yield the answers to a packet."""
 
     def _number(self, params: bytes, index: int) -> int:
         """Return an address or a length. Raises IndexError where it is missing."""
@@ -93,15 +92,15 @@ class ServoChain(EmulatedDevice, Generic[S]):
         address, length = self._number(params, 0), self._number(params, 1)
         return [(servo_id, address, length) for servo_id in params[2 * self._width :]]
 
-    def _common(self, servo: S, code: int, params: bytes, now_s: float) -> tuple[int, bytes, int] | None:
+    def _common(self, servo: S, code: int, params: bytes) -> tuple[int, bytes, int] | None:
         """Return (error, data, status return level of the answer) of an instruction of every family; else None."""
         if code == protocol1.READ:
-            return *servo.read(self._number(params, 0), self._number(params, 1), now_s), 1
+            return *servo.read(self._number(params, 0), self._number(params, 1), self._now_s), 1
         if code == protocol1.WRITE:
-            return servo.write(self._number(params, 0), params[self._width :], now_s), b"", 2
+            return servo.write(self._number(params, 0), params[self._width :], self._now_s), b"", 2
         if code == protocol1.REG_WRITE:
             return servo.register(self._number(params, 0), params[self._width :]), b"", 2
-        return (servo.action(now_s), b"", 2) if code == protocol1.ACTION else None
+        return (servo.action(self._now_s), b"", 2) if code == protocol1.ACTION else None
 
 
 # --- Protocol 2.0 ---------------------------------------------------------------------------------------------------
@@ -157,10 +156,8 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
 
     _servo_class, _width, _decode = Dynamixel2Servo, 2, staticmethod(dxl2.maybe_packet)
 
-    def _answers(
-        self, packet: dxl2.Packet, listening: dict[int, list[Dynamixel2Servo]], now_s: float
-    ) -> Iterator[Reply]:
-        code, params, number = packet.instruction, packet.params, self._number
+    def _answers(self, packet: dxl2.Packet) -> Iterator[Reply]:
+        code, params, number, listening = packet.instruction, packet.params, self._number, self._listening
         if code == dxl2.STATUS:
             return
         followers: dict[int, list[Dynamixel2Servo]] = {}  # the second id of a servo obeys, and never answers
@@ -170,23 +167,23 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
             parts = self._sync_writes(params) if code == dxl2.SYNC_WRITE else self._bulk_writes(params)
             for servo_id, address, data in parts:
                 for servo in (*listening.get(servo_id, ()), *followers.get(servo_id, ())):
-                    servo.write(address, data, now_s)
+                    servo.write(address, data, self._now_s)
         elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):
-            yield from self._reads(self._sync_reads(params), code == dxl2.FAST_SYNC_READ, listening, now_s)
+            yield from self._reads(self._sync_reads(params), code == dxl2.FAST_SYNC_READ)
         elif code in (dxl2.BULK_READ, FAST_BULK_READ):  # id, address (2), length (2) of each
             starts = range(0, len(params), 5)
             requests = [(params[i], number(params[i + 1 :], 0), number(params[i + 1 :], 1)) for i in starts]
-            yield from self._reads(requests, code == FAST_BULK_READ, listening, now_s)
+            yield from self._reads(requests, code == FAST_BULK_READ)
         elif packet.servo == dxl2.BROADCAST:
             last = 0
             for servo_id in sorted(listening):
-                for reply in self._together(listening[servo_id], code, params, now_s, broadcast=True):
+                for reply in self._together(listening[servo_id], code, params, broadcast=True):
                     yield reply._replace(pause_s=reply.pause_s + _SLOT_S * (servo_id - last))
                     last = servo_id
         else:
             for servo in followers.get(packet.servo, ()):
-                self._single(servo, code, params, now_s)
-            yield from self._together(listening.get(packet.servo, []), code, params, now_s)
+                self._single(servo, code, params)
+            yield from self._together(listening.get(packet.servo, []), code, params)
 
     def _bulk_writes(self, params: bytes) -> Iterator[Request[bytes]]:
         """Yield (id, address, data) of a bulk write."""
@@ -195,9 +192,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
             yield params[0], self._number(params[1:], 0), params[5 : 5 + length]
             params = params[5 + length :]
 
-    def _reads(
-        self, requests: Sequence[Request[int]], fast: bool, listening: dict[int, list[Dynamixel2Servo]], now_s: float
-    ) -> Iterator[Reply]:
+    def _reads(self, requests: Sequence[Request[int]], fast: bool) -> Iterator[Reply]:
         """Yield status packets in list order, up to the first id that is silent (unless the chain skips it).
 
         The one packet of a fast read is announced whole, and stops short at the first servo that is silent.
@@ -205,12 +200,11 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
         parts: list[tuple[int, int, bytes]] = []
         pause_s = 0.0
         for servo_id, address, length in requests:
-            there = [
-                servo for servo in listening.get(servo_id, ()) if servo.answers(1) and (_is_new(servo) or not fast)
-            ]
+            asked = self._listening.get(servo_id, ())
+            there = [servo for servo in asked if servo.answers(1) and (_is_new(servo) or not fast)]
             if not there and (self.chain_break or fast):
                 break
-            answers = [(servo, *servo.read(address, length, now_s)) for servo in there]
+            answers = [(servo, *servo.read(address, length, self._now_s)) for servo in there]
             if fast:
                 servo, error, data = answers[0]
                 parts.append((servo_id, _alerted(servo, error), data or bytes(length)))
@@ -223,19 +217,17 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
             yield Reply(tuple(part[0] for part in parts), dxl2.encode_fast_status(parts, announced), pause_s)
 
     def _together(
-        self, servos: list[Dynamixel2Servo], code: int, params: bytes, now_s: float, broadcast: bool = False
+        self, servos: list[Dynamixel2Servo], code: int, params: bytes, broadcast: bool = False
     ) -> Iterator[Reply]:
         """Let the servos of one id obey; yield their answer, under the id that they had."""
         ids, pause_s = [servo.id for servo in servos], max((servo.return_delay_s for servo in servos), default=0.0)
-        answers = [self._single(servo, code, params, now_s, broadcast) for servo in servos]
+        answers = [self._single(servo, code, params, broadcast) for servo in servos]
         if packets := [answer for answer in answers if answer is not None]:
             yield Reply((ids[0],), _collided(packets), pause_s)
 
-    def _single(
-        self, servo: Dynamixel2Servo, code: int, params: bytes, now_s: float, broadcast: bool = False
-    ) -> bytes | None:
+    def _single(self, servo: Dynamixel2Servo, code: int, params: bytes, broadcast: bool = False) -> bytes | None:
         """Let one servo obey an instruction; return its answer, or None."""
-        servo_id, result = servo.id, (dxl2.INSTRUCTION_ERROR, b"", 2)
+        servo_id, now_s, result = servo.id, self._now_s, (dxl2.INSTRUCTION_ERROR, b"", 2)
         if code == dxl2.PING:  # answered at any status return level: model number (2), firmware (1)
             servo.advance(now_s)
             number = servo.table.model_number or 0
@@ -252,7 +244,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
         elif code == dxl2.CLEAR:
             result = servo.clear(params, now_s), b"", 2
         else:
-            result = self._common(servo, code, params, now_s) or result
+            result = self._common(servo, code, params) or result
         error, data, level = result
         if not servo.answers(level) or (broadcast and code != dxl2.PING):
             return None
@@ -316,7 +308,7 @@ class Protocol1Servo(RegisterServo):
                 self._keep(self.table["homing_offset"])
             self._put("torque_enable", 0)
         elif value == 1 and self._get("torque_limit", 1):  # "Shutdown (18)": first a torque limit, then torque
-            self.fault_status &= ~self._bits["overload"]
+            self.fault_status &= ~self.fault_bits["overload"]
             if self._shut_down():
                 self._put("torque_enable", 0)
 
@@ -331,45 +323,41 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
 
     _servo_class, _width, _decode = Protocol1Servo, 1, staticmethod(protocol1.maybe_frame)
 
-    def _answers(
-        self, packet: protocol1.Frame, listening: dict[int, list[Protocol1Servo]], now_s: float
-    ) -> Iterator[Reply]:
-        target, code, params = packet
+    def _answers(self, packet: protocol1.Frame) -> Iterator[Reply]:
+        (target, code, params), listening = packet, self._listening
         if code == protocol1.SYNC_WRITE:
             for servo_id, address, data in self._sync_writes(params):
                 for servo in listening.get(servo_id, ()):
-                    servo.write(address, data, now_s)
+                    servo.write(address, data, self._now_s)
         elif code == protocol1.SYNC_READ:
-            yield from self._group(self._sync_reads(params), code, listening, now_s)
+            yield from self._group(self._sync_reads(params), code)
         elif code == protocol1.BULK_READ:
             # behind the 00: length, id, address of each
             requests = [(params[i + 1], params[i + 2], params[i]) for i in range(1, len(params) - 2, 3)]
-            yield from self._group(requests, code, listening, now_s)
+            yield from self._group(requests, code)
         elif target == protocol1.BROADCAST:
             for servo in [servo for servo_id in sorted(listening) for servo in listening[servo_id]]:
-                answers = list(self._single(servo, code, params, now_s))
+                answers = list(self._single(servo, code, params))
                 if code == protocol1.PING and servo.table.family == "feetech":
                     yield from answers
         else:
             for servo in listening.get(target, ()):
-                yield from self._single(servo, code, params, now_s)
+                yield from self._single(servo, code, params)
 
-    def _group(
-        self, requests: Sequence[Request[int]], code: int, listening: dict[int, list[Protocol1Servo]], now_s: float
-    ) -> Iterator[Reply]:
+    def _group(self, requests: Sequence[Request[int]], code: int) -> Iterator[Reply]:
         for servo_id, address, length in requests:
-            there = [servo for servo in listening.get(servo_id, ()) if code in servo.group_reads and servo.answers(1)]
-            if there:
-                yield _status(there[0], servo_id, *there[0].read(address, length, now_s))
+            asked = self._listening.get(servo_id, ())
+            if there := [servo for servo in asked if code in servo.group_reads and servo.answers(1)]:
+                yield _status(there[0], servo_id, *there[0].read(address, length, self._now_s))
             elif self.chain_break:
                 return
 
-    def _single(self, servo: Protocol1Servo, code: int, params: bytes, now_s: float) -> Iterator[Reply]:
+    def _single(self, servo: Protocol1Servo, code: int, params: bytes) -> Iterator[Reply]:
         """Let one servo obey an instruction; yield its answer, under the id that it had."""
-        servo_id, is_feetech = servo.id, servo.table.family == "feetech"
+        servo_id, now_s, is_feetech = servo.id, self._now_s, servo.table.family == "feetech"
         answers = [servo.answers(level) for level in range(3)]  # as the request finds it
         error, data, level = 0, b"", 2
-        if (result := self._common(servo, code, params, now_s)) is not None:
+        if (result := self._common(servo, code, params)) is not None:
             error, data, level = result
             if is_feetech and code == protocol1.READ and not data:
                 return

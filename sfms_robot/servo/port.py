@@ -182,6 +182,14 @@ class SerialPort:
         _shut(self._serial)
 
 
+def emulator_control(control: str) -> socket.socket:
+    """Return a connection to the control socket of an emulator, by its address. Raises PortError."""
+    try:
+        return connect(control)
+    except OSError as error:
+        raise PortError(f"{control}: no emulator answers there: {error}") from error
+
+
 class VirtualTimePort:
     """The device of an emulated chain, in virtual time; `control`: address of its control socket."""
 
@@ -195,10 +203,7 @@ class VirtualTimePort:
         self._wanted_from = 0
         self._written_at_s = 0.0
         self._inbox = bytearray()
-        try:
-            self._control = connect(control)
-        except OSError as error:
-            raise PortError(f"{control}: no emulator answers there: {error}") from error
+        self._control = emulator_control(control)
         self._control.settimeout(_REPLY_TIMEOUT_S)
         try:
             self._serial = _open(device, baud)
@@ -376,7 +381,7 @@ class DescriptorIO:
         connection: of a network port, which Windows waits for and reads in the same way.
     """
 
-    def __init__(self, port: serial.Serial, connection: socket.socket | None = None) -> None:
+    def __init__(self, port: serial.Serial, connection: socket.socket | None) -> None:
         self._fd = port.fileno()
         self._take = partial(os.read, self._fd) if connection is None else connection.recv
         self._give = partial(os.write, self._fd) if connection is None else connection.send

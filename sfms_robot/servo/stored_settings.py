@@ -115,30 +115,26 @@ def contradictions(values: Mapping[str, int], table: Table, needs: JointNeeds) -
         values: registers by name, as read.
     """
     found = [
-        *_mode(values, table, needs),
-        *_limits(values, table, needs),
+        *_mode_and_limits(values, table, needs),
         *_zero_and_direction(values, table, needs),
-        *_secondary_id(values, needs),
-        *_startup(values),
+        *_acts_unasked(values, needs),
         *_shutdown(values, table, needs),
         *_turns(values, table, needs),
     ]
     return sorted(found, key=lambda each: ("refused", "set", "told").index(each.then))
 
 
-def _mode(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+def _mode_and_limits(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+    """Yield another mode than that of the joint, then each limit inside the joint's range.
+
+    Protocol 2.0 refuses goals beyond a limit, the others clip them silently. Many turns need both at 4095 (MX 1.0), or
+    both at 0 (STS).
+    """
     mode, wanted = table.role("operating_mode"), operating_mode(table, needs)
     if mode is not None and wanted is not None and (now := values.get(mode.name, wanted)) != wanted:
         kinds = {_EXTENDED_MODE: "extended position", _CURRENT_POSITION_MODE: "current-based position"}
         kind = kinds.get(wanted, "position") if table.protocol == 2 else "position"
         yield Contradiction(mode.name, now, wanted, f"the joint is moved in {kind} control", then="set")
-
-
-def _limits(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield each limit inside the joint's range: Protocol 2.0 refuses goals beyond it, the others clip them silently.
-
-    Many turns need both at 4095 (MX 1.0), or both at 0 (STS).
-    """
     names = limit_names(table)
     if names is None or not values.keys() >= set(names):
         return
@@ -199,16 +195,16 @@ def offset_ticks(table: Table, stored: int) -> int:
     return -stored if table.family == "feetech" else stored
 
 
-def _secondary_id(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield an active secondary id (0..252): the servo obeys writes to that id too, and never answers them."""
+def _acts_unasked(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
+    """Yield what makes a servo act without a goal of its own.
+
+    That is an active secondary id (0..252), whose writes it obeys too and never answers, and what it does at power-up.
+    """
     now = values.get("secondary_id", 255)
     if now in needs.other_ids:
         yield Contradiction("secondary_id", now, 255, f"it would follow the goals of id {now} too", then="refused")
     elif now <= 252:
         yield Contradiction("secondary_id", now, 255, f"it obeys id {now} too", then="told", fixable=False)
-
-
-def _startup(values: Mapping[str, int]) -> Iterator[Contradiction]:
     now = values.get("startup_configuration", 0)
     if now & _TORQUE_AT_POWER_UP:
         why = "its torque comes on at power-up, wherever it stands"

@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 from published import byte_by_byte, rows
 
 from sfms_robot.servo.codecs import ssc32
-from sfms_robot.servo.codecs.ssc32 import Group, Move, Query, Unknown, maybe_command
+from sfms_robot.servo.codecs.ssc32 import Group, Move, Query, maybe_command
 
 PUBLISHED = {
     row["name"]: row["bytes"].replace("<CR>", "\r").encode()
@@ -54,8 +54,8 @@ def test_escape_throws_away_what_came_before_it_and_several_pulses_are_asked_for
 
 
 @pytest.mark.parametrize("line", [b"", b"#32P1500", b"QP 40", b"hello", b"#5", b"P1500", b"#5P1500T99999999"])
-def test_line_that_is_no_command_is_told_as_such(line):
-    assert maybe_command(bytearray(line + b"\r")) == Unknown(line)
+def test_line_that_is_not_a_command_is_dropped(line):
+    assert maybe_command(bytearray(line + b"\rQ\r")) == Query("Q")
 
 
 @pytest.mark.parametrize("pulse_us", [0, 499, 2501])

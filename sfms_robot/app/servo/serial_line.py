@@ -20,7 +20,7 @@ from sfms_robot.config import load_firmware_map, load_head, map_files, variant
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
 from sfms_robot.runtime.clock import RealClock
-from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, finish, ping_replies, verified_write
+from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, finish, looks_double, verified_write
 from sfms_robot.servo.discovery import check_device, list_ports
 from sfms_robot.servo.families import BusFamily, family_named, servo_families
 from sfms_robot.servo.port import Port, SerialPort
@@ -222,7 +222,7 @@ class Wire:
     def has_duplicate(self, servo: int) -> bool:
         """Return whether two servos seem to have one id: each of several pings brings more than one clean answer."""
         protocol = self.kind.protocol
-        return all(ping_replies(self.port, protocol, servo, PATIENCE_S).duplicate for _ in range(TRIES))
+        return all(looks_double(self.port, protocol, servo, PATIENCE_S) for _ in range(TRIES))
 
     def check_id(self, servo: int, what: str = "id") -> None:
         """Raise ConfigError for an id that no servo of the family can have."""

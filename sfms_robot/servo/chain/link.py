@@ -348,24 +348,12 @@ def finish(steps: Steps[T], wait: Callable[[float], None] = lambda duration_s: N
 # --- two servos with one id -----------------------------------------------------------------------------------------
 
 
-class PingReplies(NamedTuple):
-    """The bytes that one ping brought: whole answers of that id, and bytes that belong to no answer."""
-
-    answers: int
-    stray: int
-
-    @property
-    def duplicate(self) -> bool:
-        """Return whether this looks like two servos."""
-        return self.answers > 1 or self.stray > 0
-
-
-def ping_replies(port: Port, protocol: int, servo: int, silence_s: float) -> PingReplies:
-    """Ping one id and count what comes until there was no byte for `silence_s`; `protocol` is 2, or 1 (Feetech too).
+def looks_double(port: Port, protocol: int, servo: int, silence_s: float) -> bool:
+    """Ping one id; return whether two servos seem to have it. `protocol` is 2, or 1 (Feetech too).
 
     Two servos with one id answer together, so the ping brings two answers, or bytes that belong to none, which a link
     drops. Two servos of one model that answer in the very same instant look like one: only a wire with a single servo
-    on it is certain.
+    on it is certain. Blocks until there was no byte for `silence_s`.
     """
     if protocol == 2:
         sent = dxl2.encode_instruction(servo, dxl2.PING)
@@ -387,4 +375,4 @@ def ping_replies(port: Port, protocol: int, servo: int, silence_s: float) -> Pin
         found = [(each.servo, dxl2.STATUS_OVERHEAD + len(each.params)) for each in packets]
     else:
         found = [(frame.servo, protocol1.OVERHEAD + len(frame.params)) for frame in protocol1.salvage(data)]
-    return PingReplies(sum(each == servo for each, _ in found), total - sum(size for _, size in found))
+    return [each for each, _ in found].count(servo) > 1 or total > sum(size for _, size in found)

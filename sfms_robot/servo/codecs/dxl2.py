@@ -92,7 +92,12 @@ crc16: Final = umts  # CRC-16/BUYPASS: 0x8005, start 0, not reflected. A second 
 
 def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> bytes:
     """Return an instruction packet. Raises PacketError if it would be longer than `MAX_PACKET`."""
-    return _encode(servo, (bytes([instruction]) + params).replace(_LOOKALIKE, _STUFFED))
+    body = (bytes([instruction]) + params).replace(_LOOKALIKE, _STUFFED)
+    if len(body) + 9 > MAX_PACKET:
+        raise PacketError(f"a packet of {len(body) + 9} bytes is longer than {MAX_PACKET}")
+    # LEN = instruction + parameters + crc, after stuffing. The crc is over everything from byte 0 on.
+    packet = _HEADER + bytes([servo]) + (len(body) + 2).to_bytes(2, "little") + body
+    return packet + crc16(packet).to_bytes(2, "little")
 
 
 def encode_sync_write(address: int, length: int, rows: bytes) -> bytes:
@@ -104,7 +109,7 @@ def encode_sync_write(address: int, length: int, rows: bytes) -> bytes:
 
 def encode_status(servo: int, error: int, data: bytes = b"") -> bytes:
     """Return a status packet, as a servo sends it."""
-    return _encode(servo, (bytes([STATUS, error]) + data).replace(_LOOKALIKE, _STUFFED))
+    return encode_instruction(servo, STATUS, bytes([error]) + data)
 
 
 def encode_fast_status(replies: Iterable[tuple[int, int, bytes]], length: int | None = None) -> bytes:
@@ -145,14 +150,6 @@ def split_fast_status(data: bytes | bytearray, length: int) -> list[tuple[int, i
 
 def _proved(data: bytes) -> bool:
     return crc16(data[:-2]) == data[-2] | data[-1] << 8
-
-
-def _encode(servo: int, body: bytes) -> bytes:
-    if len(body) + 9 > MAX_PACKET:
-        raise PacketError(f"a packet of {len(body) + 9} bytes is longer than {MAX_PACKET}")
-    # LEN = instruction + parameters + crc, after stuffing. The crc is over everything from byte 0 on.
-    packet = _HEADER + bytes([servo]) + (len(body) + 2).to_bytes(2, "little") + body
-    return packet + crc16(packet).to_bytes(2, "little")
 
 
 def maybe_packet(buffer: bytearray) -> Packet | None:

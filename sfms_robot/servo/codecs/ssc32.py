@@ -59,13 +59,6 @@ class Query:
     channels: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True)
-class Unknown:
-    """A line that is not a command."""
-
-    line: bytes
-
-
 def group_move(moves: Mapping[int, Move], time_ms: int = 0) -> bytes:
     """Return one command for all of `moves` (channel -> move), in its order; they start and stop together in `time_ms`.
 
@@ -94,40 +87,41 @@ def query_moving() -> bytes:
     return b"Q\r"
 
 
-def maybe_command(buffer: bytearray) -> Group | Query | Unknown | None:
+def maybe_command(buffer: bytearray) -> Group | Query | None:
     """Take the first whole command off the front of `buffer`, or return None: more bytes are needed.
 
-    An endless line is returned as Unknown in pieces of `MAX_LINE` bytes.
+    Lines that are not commands are dropped, an endless one in pieces of `MAX_LINE` bytes.
     """
-    end = buffer.find(_CR)
-    escape = buffer.rfind(_ESC, 0, end if end >= 0 else len(buffer))
-    if escape >= 0:
-        del buffer[: escape + 1]
+    while True:
         end = buffer.find(_CR)
-    if end < 0:
-        if len(buffer) < MAX_LINE:
-            return None
-        end = MAX_LINE - 1
-    line = bytes(buffer[:end])
-    del buffer[: end + 1]
-    return _parsed(line)
+        escape = buffer.rfind(_ESC, 0, end if end >= 0 else len(buffer))
+        if escape >= 0:
+            del buffer[: escape + 1]
+            end = buffer.find(_CR)
+        if end < 0:
+            if len(buffer) < MAX_LINE:
+                return None
+            end = MAX_LINE - 1
+        line = buffer[:end].decode("ascii", "replace").upper().strip()
+        del buffer[: end + 1]
+        if (command := _parsed(line)) is not None:
+            return command
 
 
-def _parsed(line: bytes) -> Group | Query | Unknown:
-    spaced = line.decode("ascii", "replace").upper().strip()
-    text = re.sub(r"\s+", "", spaced)  # "spaces anywhere"
+def _parsed(line: str) -> Group | Query | None:
+    text = re.sub(r"\s+", "", line)  # "spaces anywhere"
     if text in ("Q", "VER"):
         return Query(text)
-    if _QUERY.fullmatch(spaced):
-        channels = tuple(int(number) for number in re.findall(r"\d+", spaced))
-        return Query("QP", channels) if max(channels) < CHANNELS else Unknown(line)
+    if _QUERY.fullmatch(line):
+        channels = tuple(int(number) for number in re.findall(r"\d+", line))
+        return Query("QP", channels) if max(channels) < CHANNELS else None
     whole = _GROUP.fullmatch(text)
     if whole is None:
-        return Unknown(line)
+        return None
     moves, levels = {}, {}
     for channel, pulse, speed, level in _ITEM.findall(whole[1]):
         if int(channel) >= CHANNELS:
-            return Unknown(line)
+            return None
         if level:
             levels[int(channel)] = level == "H"
         else:
