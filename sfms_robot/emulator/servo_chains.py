@@ -7,6 +7,7 @@ False, the others answer. Two servos with one id obey both; Dynamixels of Protoc
 
 from __future__ import annotations
 
+import itertools
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import reduce
@@ -19,8 +20,8 @@ from sfms_robot.servo.codecs import dxl2, protocol1
 from sfms_robot.servo.registers import Field, Table
 
 FAST_BULK_READ: Final = 0x9A
+_FAST_READS: Final = {dxl2.FAST_SYNC_READ, FAST_BULK_READ}
 _GAP_S: Final = 0.05  # an unfinished packet older than this is forgotten
-_SLOT_S: Final = 0.003  # a broadcast ping is answered in the order of ids, each in its own slot
 _FAST_FIRMWARE: Final = 45  # from here on a servo knows fast reads
 _CENTER_ON_STS: Final = 2048
 _LIMITED: Final = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
@@ -42,6 +43,9 @@ class ServoChain(EmulatedDevice, Generic[S]):
     _servo_class: type[S]
     _width: int  # bytes of an address and of a length in the parameters of an instruction
     _decode: Callable[[bytearray], Any]  # takes a whole packet off the front of a buffer, or returns None
+    _encode: Callable[[int, int, bytes], bytes]  # returns a status packet: id, error, data
+    _bulk_write: int | None = None  # an instruction of Protocol 2.0
+    _slot_s = 0.0  # answers to a broadcast come in the order of ids, each in its own slot
 
     def __init__(self, servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool = True) -> None:
         self.servos: list[S] = [self._servo_class(servo, tables[servo.model]) for servo in servos]
@@ -68,13 +72,75 @@ class ServoChain(EmulatedDevice, Generic[S]):
             if not self._listening:
                 self._buffer.clear()  # noise of another baud
             try:
-                yield from self._answers(packet)
+                yield from self._answers(*packet[:3])
             except IndexError:
                 continue  # parameters are missing: no servo knows what was meant
 
+    def _answers(self, target: int, code: int, params: bytes) -> Iterator[Reply]:
+        """Yield the answers to a packet: id, instruction, parameters."""
+        listening = self._listening
+        followers: dict[int, list[S]] = {}  # the second id of a servo obeys, and never answers
+        for servo in itertools.chain(*listening.values()):
+            if servo.second_id is not None:
+                followers.setdefault(servo.second_id, []).append(servo)
+        if code in (dxl2.SYNC_WRITE, self._bulk_write):  # nothing answers
+            parts = self._sync_writes(params) if code == dxl2.SYNC_WRITE else self._bulk_writes(params)
+            for servo_id, address, data in parts:
+                for servo in (*listening.get(servo_id, ()), *followers.get(servo_id, ())):
+                    servo.write(address, data, self._now_s)
+        elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):
+            yield from self._reads(self._sync_reads(params), code)
+        elif code in (dxl2.BULK_READ, FAST_BULK_READ):
+            yield from self._reads(self._bulk_reads(params), code)
+        elif target == dxl2.BROADCAST:
+            last = 0
+            for servo_id in sorted(listening):
+                for reply in self._together([self._single(each, code, params, True) for each in listening[servo_id]]):
+                    yield reply._replace(pause_s=reply.pause_s + self._slot_s * (servo_id - last))
+                    last = servo_id
+        else:
+            for servo in followers.get(target, ()):
+                self._single(servo, code, params)
+            yield from self._together([self._single(each, code, params) for each in listening.get(target, ())])
+
     @abstractmethod
-    def _answers(self, packet: Any) -> Iterator[Reply]:
-        """Yield the answers to a packet."""
+    def _bulk_reads(self, params: bytes) -> list[Request[int]]:
+        """Return (id, address, length) of a bulk read."""
+
+    def _reads(self, requests: Sequence[Request[int]], code: int) -> Iterator[Reply]:
+        """Yield status packets in list order, up to the first id that is silent (unless the chain skips it).
+
+        The one packet of a fast read is announced whole, and stops short at the first servo that is silent.
+        """
+        fast, pause_s = code in _FAST_READS, 0.0
+        parts: list[tuple[int, int, bytes]] = []
+        for servo_id, address, length in requests:
+            asked = self._listening.get(servo_id, ())
+            there = [servo for servo in asked if servo.answers(1) and code in servo.group_reads]
+            if not there and (self.chain_break or fast):
+                break
+            answers = [(servo, *servo.read(address, length, self._now_s)) for servo in there]
+            if fast:
+                servo, error, data = answers[0]
+                parts.append((servo_id, error | servo.alert, data or bytes(length)))
+                pause_s += servo.return_delay_s
+            else:
+                replies = [self._status(servo, servo_id, error, data) for servo, error, data in answers]
+                yield from self._together(replies)
+        announced = 1 + sum(length + 4 for *_, length in requests)  # LEN: as far as the last servo of the list
+        if parts and announced < dxl2.MAX_PACKET + 1:
+            yield Reply(tuple(part[0] for part in parts), dxl2.encode_fast_status(parts, announced), pause_s)
+
+    @abstractmethod
+    def _single(self, servo: S, code: int, params: bytes, broadcast: bool = False) -> Reply | None:
+        """Let one servo obey an instruction; return its answer, if any, under the id that it had."""
+
+    def _status(self, servo: S, servo_id: int, error: int, data: bytes = b"") -> Reply:
+        return Reply((servo_id,), self._encode(servo_id, error | servo.alert, data), servo.return_delay_s)
+
+    def _together(self, answers: Sequence[Reply | None]) -> Iterator[Reply]:
+        """Yield what the wire carries of the answers of all servos of one id."""
+        yield from filter(None, answers)
 
     def _number(self, params: bytes, index: int) -> int:
         """Return an address or a length. Raises IndexError where it is missing."""
@@ -86,6 +152,13 @@ class ServoChain(EmulatedDevice, Generic[S]):
         address, length = self._number(params, 0), self._number(params, 1)
         for start in range(2 * self._width, len(params) - length, length + 1):
             yield params[start], address, params[start + 1 : start + 1 + length]
+
+    def _bulk_writes(self, params: bytes) -> Iterator[Request[bytes]]:
+        """Yield (id, address, data) of a bulk write of Protocol 2.0."""
+        while params:  # id, address (2), length (2), data
+            length = self._number(params[1:], 1)
+            yield params[0], self._number(params[1:], 0), params[5 : 5 + length]
+            params = params[5 + length :]
 
     def _sync_reads(self, params: bytes) -> list[Request[int]]:
         """Return (id, address, length) of a sync read: address, length, then ids."""
@@ -111,6 +184,16 @@ class Dynamixel2Servo(RegisterServo):
 
     _beyond, _unknown = dxl2.DATA_RANGE_ERROR, dxl2.ACCESS_ERROR
     _start_s = _REBOOT_S
+
+    def __init__(self, what: EmulatedServo, table: Table) -> None:
+        self.group_reads = {dxl2.SYNC_READ, dxl2.BULK_READ}
+        if what.firmware >= _FAST_FIRMWARE and "operating_mode" in table.fields:
+            self.group_reads |= _FAST_READS
+        super().__init__(what, table)
+
+    @property
+    def alert(self) -> int:
+        return dxl2.ALERT if self.fault_status else 0
 
     def clear(self, params: bytes, now_s: float) -> int:
         """Forget whole turns, only at rest; return the error."""
@@ -154,88 +237,30 @@ class Dynamixel2Servo(RegisterServo):
 class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
     """Servos that speak Protocol 2.0."""
 
-    _servo_class, _width, _decode = Dynamixel2Servo, 2, staticmethod(dxl2.maybe_packet)
+    _servo_class, _width = Dynamixel2Servo, 2
+    _decode, _encode = staticmethod(dxl2.maybe_packet), staticmethod(dxl2.encode_status)
+    _bulk_write, _slot_s = dxl2.BULK_WRITE, 0.003
 
-    def _answers(self, packet: dxl2.Packet) -> Iterator[Reply]:
-        code, params, number, listening = packet.instruction, packet.params, self._number, self._listening
-        if code == dxl2.STATUS:
-            return
-        followers: dict[int, list[Dynamixel2Servo]] = {}  # the second id of a servo obeys, and never answers
-        for servo in (servo for each in listening.values() for servo in each if servo.second_id is not None):
-            followers.setdefault(servo.second_id or 0, []).append(servo)
-        if code in (dxl2.SYNC_WRITE, dxl2.BULK_WRITE):  # nothing answers
-            parts = self._sync_writes(params) if code == dxl2.SYNC_WRITE else self._bulk_writes(params)
-            for servo_id, address, data in parts:
-                for servo in (*listening.get(servo_id, ()), *followers.get(servo_id, ())):
-                    servo.write(address, data, self._now_s)
-        elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):
-            yield from self._reads(self._sync_reads(params), code == dxl2.FAST_SYNC_READ)
-        elif code in (dxl2.BULK_READ, FAST_BULK_READ):  # id, address (2), length (2) of each
-            starts = range(0, len(params), 5)
-            requests = [(params[i], number(params[i + 1 :], 0), number(params[i + 1 :], 1)) for i in starts]
-            yield from self._reads(requests, code == FAST_BULK_READ)
-        elif packet.servo == dxl2.BROADCAST:
-            last = 0
-            for servo_id in sorted(listening):
-                for reply in self._together(listening[servo_id], code, params, broadcast=True):
-                    yield reply._replace(pause_s=reply.pause_s + _SLOT_S * (servo_id - last))
-                    last = servo_id
-        else:
-            for servo in followers.get(packet.servo, ()):
-                self._single(servo, code, params)
-            yield from self._together(listening.get(packet.servo, []), code, params)
+    def _bulk_reads(self, params: bytes) -> list[Request[int]]:
+        # id, address (2), length (2) of each
+        rows = [(params[i], params[i + 1 :]) for i in range(0, len(params), 5)]
+        return [(servo_id, self._number(where, 0), self._number(where, 1)) for servo_id, where in rows]
 
-    def _bulk_writes(self, params: bytes) -> Iterator[Request[bytes]]:
-        """Yield (id, address, data) of a bulk write."""
-        while params:  # id, address (2), length (2), data
-            length = self._number(params[1:], 1)
-            yield params[0], self._number(params[1:], 0), params[5 : 5 + length]
-            params = params[5 + length :]
+    def _together(self, answers: Sequence[Reply | None]) -> Iterator[Reply]:
+        """Yield the one packet that comes of all: they talk at once."""
+        if packets := list(filter(None, answers)):
+            yield packets[0]._replace(data=_collided([packet.data for packet in packets]))
 
-    def _reads(self, requests: Sequence[Request[int]], fast: bool) -> Iterator[Reply]:
-        """Yield status packets in list order, up to the first id that is silent (unless the chain skips it).
-
-        The one packet of a fast read is announced whole, and stops short at the first servo that is silent.
-        """
-        parts: list[tuple[int, int, bytes]] = []
-        pause_s = 0.0
-        for servo_id, address, length in requests:
-            asked = self._listening.get(servo_id, ())
-            there = [servo for servo in asked if servo.answers(1) and (_is_new(servo) or not fast)]
-            if not there and (self.chain_break or fast):
-                break
-            answers = [(servo, *servo.read(address, length, self._now_s)) for servo in there]
-            if fast:
-                servo, error, data = answers[0]
-                parts.append((servo_id, _alerted(servo, error), data or bytes(length)))
-                pause_s += servo.return_delay_s
-            elif there:
-                packets = [dxl2.encode_status(servo_id, _alerted(servo, error), data) for servo, error, data in answers]
-                yield Reply((servo_id,), _collided(packets), there[0].return_delay_s)
-        announced = 1 + sum(length + 4 for *_, length in requests)  # LEN: as far as the last servo of the list
-        if parts and announced < dxl2.MAX_PACKET + 1:
-            yield Reply(tuple(part[0] for part in parts), dxl2.encode_fast_status(parts, announced), pause_s)
-
-    def _together(
-        self, servos: list[Dynamixel2Servo], code: int, params: bytes, broadcast: bool = False
-    ) -> Iterator[Reply]:
-        """Let the servos of one id obey; yield their answer, under the id that they had."""
-        ids, pause_s = [servo.id for servo in servos], max((servo.return_delay_s for servo in servos), default=0.0)
-        answers = [self._single(servo, code, params, broadcast) for servo in servos]
-        if packets := [answer for answer in answers if answer is not None]:
-            yield Reply((ids[0],), _collided(packets), pause_s)
-
-    def _single(self, servo: Dynamixel2Servo, code: int, params: bytes, broadcast: bool = False) -> bytes | None:
-        """Let one servo obey an instruction; return its answer, or None."""
+    def _single(self, servo: Dynamixel2Servo, code: int, params: bytes, broadcast: bool = False) -> Reply | None:
         servo_id, now_s, result = servo.id, self._now_s, (dxl2.INSTRUCTION_ERROR, b"", 2)
         if code == dxl2.PING:  # answered at any status return level: model number (2), firmware (1)
             servo.advance(now_s)
             number = servo.table.model_number or 0
             result = 0, number.to_bytes(2, "little") + bytes([servo.firmware]), 0
-        elif code == dxl2.READ and broadcast:
+        elif code == dxl2.STATUS or (code == dxl2.READ and broadcast):
             return None
         elif code in (dxl2.REBOOT, dxl2.FACTORY_RESET):  # answered first, in the state that it is in
-            reply = dxl2.encode_status(servo_id, _alerted(servo, 0)) if servo.answers(2) and not broadcast else None
+            reply = self._status(servo, servo_id, 0) if servo.answers(2) and not broadcast else None
             if code == dxl2.REBOOT:
                 servo.power_cycle(now_s)
             elif not (broadcast and params[0] == 0xFF):  # ignored since firmware 42: all would have one id
@@ -248,16 +273,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
         error, data, level = result
         if not servo.answers(level) or (broadcast and code != dxl2.PING):
             return None
-        return dxl2.encode_status(servo_id, _alerted(servo, error), data)
-
-
-def _alerted(servo: Dynamixel2Servo, error: int) -> int:
-    return error | (dxl2.ALERT if servo.fault_status else 0)
-
-
-def _is_new(servo: Dynamixel2Servo) -> bool:
-    """Return whether a servo knows fast reads."""
-    return servo.firmware >= _FAST_FIRMWARE and "operating_mode" in servo.table.fields
+        return self._status(servo, servo_id, error, data)
 
 
 def _collided(packets: Sequence[bytes]) -> bytes:
@@ -321,46 +337,21 @@ class Protocol1Servo(RegisterServo):
 class Protocol1Chain(ServoChain[Protocol1Servo]):
     """Servos that speak the FF FF frame. Frames of Protocol 2.0 on the same wire look like noise to them."""
 
-    _servo_class, _width, _decode = Protocol1Servo, 1, staticmethod(protocol1.maybe_frame)
+    _servo_class, _width = Protocol1Servo, 1
+    _decode, _encode = staticmethod(protocol1.maybe_frame), staticmethod(protocol1.encode)
 
-    def _answers(self, packet: protocol1.Frame) -> Iterator[Reply]:
-        (target, code, params), listening = packet, self._listening
-        if code == protocol1.SYNC_WRITE:
-            for servo_id, address, data in self._sync_writes(params):
-                for servo in listening.get(servo_id, ()):
-                    servo.write(address, data, self._now_s)
-        elif code == protocol1.SYNC_READ:
-            yield from self._group(self._sync_reads(params), code)
-        elif code == protocol1.BULK_READ:
-            # behind the 00: length, id, address of each
-            requests = [(params[i + 1], params[i + 2], params[i]) for i in range(1, len(params) - 2, 3)]
-            yield from self._group(requests, code)
-        elif target == protocol1.BROADCAST:
-            for servo in [servo for servo_id in sorted(listening) for servo in listening[servo_id]]:
-                answers = list(self._single(servo, code, params))
-                if code == protocol1.PING and servo.table.family == "feetech":
-                    yield from answers
-        else:
-            for servo in listening.get(target, ()):
-                yield from self._single(servo, code, params)
+    def _bulk_reads(self, params: bytes) -> list[Request[int]]:
+        # behind the 00: length, id, address of each
+        return [(params[i + 1], params[i + 2], params[i]) for i in range(1, len(params) - 2, 3)]
 
-    def _group(self, requests: Sequence[Request[int]], code: int) -> Iterator[Reply]:
-        for servo_id, address, length in requests:
-            asked = self._listening.get(servo_id, ())
-            if there := [servo for servo in asked if code in servo.group_reads and servo.answers(1)]:
-                yield _status(there[0], servo_id, *there[0].read(address, length, self._now_s))
-            elif self.chain_break:
-                return
-
-    def _single(self, servo: Protocol1Servo, code: int, params: bytes) -> Iterator[Reply]:
-        """Let one servo obey an instruction; yield its answer, under the id that it had."""
+    def _single(self, servo: Protocol1Servo, code: int, params: bytes, broadcast: bool = False) -> Reply | None:
         servo_id, now_s, is_feetech = servo.id, self._now_s, servo.table.family == "feetech"
         answers = [servo.answers(level) for level in range(3)]  # as the request finds it
         error, data, level = 0, b"", 2
         if (result := self._common(servo, code, params)) is not None:
             error, data, level = result
             if is_feetech and code == protocol1.READ and not data:
-                return
+                return None
         elif code == protocol1.PING:
             servo.advance(now_s)
             level = 0
@@ -372,12 +363,9 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
         elif code == protocol1.RESET_TURNS and servo.is_sts:
             servo.forget_turns(now_s)
         elif is_feetech:
-            return
+            return None
         else:
             error = protocol1.INSTRUCTION
-        if answers[level]:
-            yield _status(servo, servo_id, error, data)
-
-
-def _status(servo: Protocol1Servo, servo_id: int, error: int, data: bytes) -> Reply:
-    return Reply((servo_id,), protocol1.encode(servo_id, error | servo.fault_status, data), servo.return_delay_s)
+        if not answers[level] or (broadcast and not (is_feetech and code == protocol1.PING)):
+            return None
+        return self._status(servo, servo_id, error, data)
