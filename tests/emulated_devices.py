@@ -3,6 +3,7 @@
 from sfms_robot.config import load_firmware_map, variant
 from sfms_robot.emulator.chain_process import plugged
 from sfms_robot.emulator.launch import EmulatedServo
+from sfms_robot.servo.codecs import maestro
 from sfms_robot.servo.registers import Table
 
 
@@ -14,6 +15,11 @@ def servos_of(model, *ids, start_ticks=None, **more):
     """What is plugged in: servos of one model, in the middle of their range unless told otherwise."""
     start_ticks = load_firmware_map(model).center_ticks if start_ticks is None else start_ticks
     return [EmulatedServo(i, model, start_ticks=start_ticks, **more) for i in ids]
+
+
+def addressed(command, device=maestro.DEFAULT_DEVICE):
+    """A command in the Pololu protocol: AA, number of the board, the command without its top bit, its data."""
+    return bytes([maestro.BAUD_INDICATION, device, command[0] & 0x7F]) + command[1:]
 
 
 def device_of(*servos, chain_break=True):

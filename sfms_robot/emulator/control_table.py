@@ -45,7 +45,6 @@ _FULL_TORQUE: Final = 1000  # torque limit: 0.1 %, although it goes to 1023 in D
 _FULL_AX_SPEED: Final = 1023.0
 _SCS_SIGN: Final = 1 << 10
 _COUNTS_TURNS: Final = 0x10  # STS phase (18), bit 4: positions beyond one turn are reported
-_PER_TURN: Final = {"rpm": 60.0, "rev_per_min2": 3600.0}  # seconds, seconds squared; all other units are degrees
 
 
 class ControlTable:
@@ -276,7 +275,4 @@ def _duty(memory: ControlTable) -> float:
 
 def _rate(memory: ControlTable, field: Field | None) -> float:
     """Return a speed or an acceleration in ticks and seconds, with its sign; 0 where the model has no such register."""
-    if field is None:
-        return 0.0
-    per_turn = _PER_TURN.get(field.unit, 360.0)
-    return field.to_unit(memory.get(field.name)) * memory.table.ticks_per_revolution / per_turn
+    return 0.0 if field is None else memory.table.in_ticks(field, memory.get(field.name))

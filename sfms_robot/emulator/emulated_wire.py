@@ -118,8 +118,7 @@ class EmulatedWire:
 
     def servo(self, servo_id: int) -> Any:
         """Return the servo or channel of that id on any device, or None."""
-        found = (device.servo(servo_id) for device in self._devices)
-        return next((servo for servo in found if servo is not None), None)
+        return next((servo for each in self._devices if (servo := each.servo(servo_id)) is not None), None)
 
     @property
     def traffic(self) -> tuple[int, int]:

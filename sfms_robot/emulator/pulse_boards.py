@@ -102,7 +102,7 @@ class EmulatedBoard(EmulatedDevice):
 
     Attributes:
         servos: Channels with a servo plugged in.
-        limits: Shortest and longest pulse of each channel, ticks.
+        limits: Shortest and longest pulse of every channel, ticks.
     """
 
     def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:
@@ -113,7 +113,7 @@ class EmulatedBoard(EmulatedDevice):
         starts = {servo.id: servo.start_ticks for servo in servos}
         self.channels = [Channel(i, self, starts.get(i, table.center_ticks)) for i in range(table.channels)]
         self.servos = [channel for channel in self.channels if channel.id in starts]
-        self.limits = [self._ticks(*table.pulse_us) for _ in self.channels]
+        self.limits = self._ticks(*table.pulse_us)
         self._buffer = bytearray()
         self._now_s = 0.0  # while it obeys
 
@@ -150,10 +150,10 @@ class EmulatedBoard(EmulatedDevice):
 
     def _send(self, channel: Channel, goal: float) -> None:
         """Send a target, brought inside the limits of the channel; 0 ends the pulses."""
-        shortest, longest = self.limits[channel.id]
         if goal == 0:
             channel.off(self._now_s)
         else:
+            shortest, longest = self.limits
             channel.send(min(max(goal, shortest), longest), self._now_s)
 
 
@@ -167,7 +167,7 @@ class MaestroBoard(EmulatedBoard):
         super().__init__(table, servos)
         self.baud: int | None = None
         self.crc = any(servo.registers.get("crc") for servo in servos)
-        self.limits = [self._ticks(*maestro.FACTORY_PULSE_US) for _ in self.channels]
+        self.limits = self._ticks(*maestro.FACTORY_PULSE_US)
 
     def _obey_all(self, data: bytes, baud: int) -> bytes:
         if self.baud is None:

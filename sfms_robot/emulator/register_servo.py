@@ -48,21 +48,6 @@ _FULL_TORQUE: Final = 1000
 _NEAR_TICKS: Final = 8.0  # of its goal: a Dynamixel 2.0 reports "in position"
 USUAL_BITS: Final = {"voltage": 0x01, "overheating": 0x04, "overload": 0x20}  # where the firmware map names none
 _SUPPLIES: Final = ((7.5, 5.0), (9.0, 7.4), (16.5, 12.0))  # up to this highest supply [V] -> usual supply [V]
-_MEASURED: Final = (  # roles and registers that are worked out whenever they are read
-    "present_position",
-    "present_speed",
-    "present_current",
-    "present_load",
-    "present_pwm",
-    "voltage",
-    "temperature",
-    "error_status",
-    "moving",
-    "moving_status",
-    "realtime_tick",
-    "velocity_trajectory",
-    "position_trajectory",
-)
 _PENDING: Final = ("registered_instruction", "registered", "async_write_flag")  # 1 from REG WRITE to ACTION
 
 
@@ -74,6 +59,7 @@ class RegisterServo(ABC):
         mute: It obeys, and never answers.
         fault_status: Bits of its faults, as the firmware map numbers them.
         plant: The motor; its ticks are those of the shaft.
+        group_reads: Instructions to several servos at once that it answers.
         fault_bits: Bit of the voltage, overheating and overload fault, by name.
         id, second_id, baud, return_delay_s, torque: As the registers say now.
     """
@@ -91,10 +77,9 @@ class RegisterServo(ABC):
         self._powered, self._tripped = True, False
         self._received_at_s = self._deaf_until_s = 0.0
         self._checks = 0
-        self._measured = {field.name: role for role in _MEASURED if (field := table.role(role))}
+        self._roles = {field.name: role for role in table.roles if (field := table.role(role))}
         speed = table.role("present_speed")
-        per_turn = 60.0 if speed is None or speed.unit == "rpm" else 360.0
-        self._speed_per_tick = per_turn / (table.ticks_per_revolution * (speed.scale if speed else 1.0))
+        self._speed_unit = table.in_ticks(speed) if speed else 1.0
         current = table.role("present_current")
         self._current_scale = current.scale or 1.0 if current else 1.0
         named = table.servo_faults.items()
@@ -135,19 +120,19 @@ class RegisterServo(ABC):
         data = b""
         for start, size in self._memory.runs(address, length):
             for field in self._memory.covered(start, size):
-                if (role := self._measured.get(field.name)) is not None:
-                    self._put(field.name, round(self._measure(role, now_s)))
+                if (now := self._measured(self._roles.get(field.name, field.name), now_s)) is not None:
+                    self._put(field.name, round(now))
             data += self._memory.raw[start : start + size]
         return 0, data
 
-    def _measure(self, role: str, now_s: float) -> float:
-        """Return the value of a measured register, before it is rounded."""
+    def _measured(self, role: str, now_s: float) -> float | None:
+        """Return the value of a register that is worked out whenever it is read, before it is rounded; else None."""
         plant, sign, drive = self.plant, self.frame.sign, self.drive
         match role:
             case "present_position":
                 return self.frame.shown(plant.position)
             case "present_speed":
-                return sign * plant.speed * self._speed_per_tick
+                return sign * plant.speed / self._speed_unit
             case "present_current":
                 return sign * plant.current_mA() / self._current_scale
             case "present_load":
@@ -167,11 +152,12 @@ class RegisterServo(ABC):
             case "realtime_tick":
                 return int(now_s * 1000.0) & 0x7FFF
             case "velocity_trajectory":
-                return sign * plant.reference_speed * self._speed_per_tick
+                return sign * plant.reference_speed / self._speed_unit
             case "position_trajectory":
                 return self.frame.reported(plant.reference)
-            case _:
+            case "error_status":
                 return self.fault_status
+        return None
 
     def write(self, address: int, data: bytes, now_s: float) -> int:
         """Return the error, 0 when the data were taken. A Dynamixel changes nothing unless all of it is allowed."""
@@ -309,10 +295,16 @@ class RegisterServo(ABC):
 
     # --- firmware -----------------------------------------------------------------------------------------------
 
+    group_reads: set[int]
     _beyond: int  # error of a read beyond the table
     _unknown: int  # error of a write where there is no register
     _nothing_registered = 0
     _start_s = 0.0  # it neither listens nor answers after power-up
+
+    @property
+    def alert(self) -> int:
+        """Return what its faults add to the error of every answer."""
+        return self.fault_status
 
     @abstractmethod
     def _refusal(self, field: Field, value: int | None) -> int:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 ASSUMED_SPEED_DEG_S = 300.0  # no-load speed if the maker states none: only an emulated motor needs one
 ByteOrder = Literal["little", "big"]
 
+_PER_TURN: Final = {"rpm": 60.0, "rev_per_min2": 3600.0}  # seconds, seconds squared; all other units are degrees
 _ACCELERATIONS: Final = ("profile_acceleration", "goal_acceleration", "acceleration")
 _FROM_ROW: Final = {"address", "size", "access", "area", "unit", "scale", "low", "high", "signed"}
 
@@ -152,6 +153,10 @@ class Table:
     def acceleration(self) -> Field | None:
         """Return the register that limits the acceleration on the way to a goal; None if the model has none."""
         return next((self.fields[name] for name in _ACCELERATIONS if name in self.fields), None)
+
+    def in_ticks(self, field: Field, value: int = 1) -> float:
+        """Return the value of a register of speed or acceleration in ticks and seconds."""
+        return field.to_unit(value) * self.ticks_per_revolution / _PER_TURN.get(field.unit, 360.0)
 
     @property
     def size(self) -> int:

@@ -1,5 +1,5 @@
 import pytest
-from emulated_devices import device_of, servos_of
+from emulated_devices import addressed, device_of, servos_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -30,7 +30,7 @@ def test_boards_hear_their_own_baud_rate_alone():
     assert board.receive(AA + maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
     assert board.receive(maestro.get_errors(), 115200, 0.0) == b"\x00\x00"
     board = device_of(*servos_of("maestro-24", 0))
-    assert board.receive(maestro.addressed(maestro.get_errors()), 57600, 0.0) == b"\x00\x00" and board.baud == 57600
+    assert board.receive(addressed(maestro.get_errors()), 57600, 0.0) == b"\x00\x00" and board.baud == 57600
     board = maestro_board()
     board.receive(maestro.set_target(0, 6000), 115200, 0.0)
     assert board.receive(maestro.get_errors(), 9600, 0.0) == b"" and errors(board) == maestro.SIGNAL_ERROR
@@ -99,7 +99,7 @@ def test_board_is_unplugged_when_every_channel_is_dead():
 
 CRC_CASES = [
     (maestro.sealed(maestro.set_target(0, 6000)), 6000, 0),
-    (maestro.sealed(maestro.addressed(maestro.set_target(0, 6000))), 6000, 0),
+    (maestro.sealed(addressed(maestro.set_target(0, 6000))), 6000, 0),
     (bytes([maestro.MINI_SSC, 0, 127]), 6000, 0),
     (maestro.set_target(0, 6000) + b"\x00", 0, maestro.CRC_ERROR),
     (maestro.set_target(0, 6000), 0, maestro.PROTOCOL_ERROR),  # the next command interrupts it
@@ -146,5 +146,6 @@ def test_rubbish_moves_no_channel_out_of_its_limits(chunks, model):
         now_s += 0.01
         board.receive(chunk, 9600, now_s)
     board.advance(now_s + 1.0)
-    for channel, (shortest, longest) in zip(board.channels, board.limits, strict=True):
+    shortest, longest = board.limits
+    for channel in board.channels:
         assert channel.pulse == 0 or shortest <= channel.pulse <= longest

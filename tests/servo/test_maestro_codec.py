@@ -1,6 +1,8 @@
 import itertools
+from functools import partial
 
 import pytest
+from emulated_devices import addressed
 from hypothesis import given
 from hypothesis import strategies as st
 from published import byte_by_byte, rows
@@ -13,12 +15,13 @@ PUBLISHED = {
 }
 BUILT = {
     "set target channel 0 1500 us": maestro.set_target(0, 6000),
-    "set target channel 0 1500 us device 12": maestro.addressed(maestro.set_target(0, 6000), 12),
+    "set target channel 0 1500 us device 12": addressed(maestro.set_target(0, 6000), 12),
     "set targets channels 3 and 4 0 and 6000": maestro.set_targets(3, [0, 6000]),
     "get position channel 2": maestro.get_position(2),
     "get errors": maestro.get_errors(),
 }
 
+to_seven = partial(addressed, device=7)
 words = st.integers(0, maestro.MAX_WORD)
 channels = st.integers(0, 23)
 commands = st.one_of(
@@ -50,19 +53,18 @@ def test_value_beyond_14_bits_is_refused(value):
 
 
 @pytest.mark.parametrize("crc", [False, True])
-@given(commands, st.booleans())
-def test_reader_gives_back_what_the_builders_made_byte_by_byte(crc, command, addressed):
-    sent = maestro.addressed(command, 7) if addressed else command
+@given(commands, st.sampled_from([bytes, to_seven]))
+def test_reader_gives_back_what_the_builders_made_byte_by_byte(crc, command, form):
+    sent = form(command)
     if crc and command[0] != maestro.MINI_SSC:
         sent = maestro.sealed(sent)
     taken = byte_by_byte(lambda buffer: maybe_command(buffer, 7, crc=crc), sent)
     assert taken == MaestroCommand(command[0], command[1:])
 
 
-@pytest.mark.parametrize("addressed", [False, True])
-def test_no_target_changed_in_one_byte_gets_past_the_crc(addressed):
-    command = maestro.set_target(3, 6000)
-    sent = maestro.sealed(maestro.addressed(command, 7) if addressed else command)
+@pytest.mark.parametrize("form", [bytes, to_seven])
+def test_no_target_changed_in_one_byte_gets_past_the_crc(form):
+    sent = maestro.sealed(form(maestro.set_target(3, 6000)))
     for at, change in itertools.product(range(len(sent)), range(1, 256)):
         wrong = bytearray(sent)
         wrong[at] ^= change
@@ -75,7 +77,7 @@ def test_damaged_interrupted_and_foreign_commands_leave_the_next_one_whole():
     wrong[1] = maestro.MINI_SSC
     assert maybe_command(wrong, crc=True).error
     assert maybe_command(wrong, crc=True) == MaestroCommand(maestro.MINI_SSC, bytes([2, 0]))
-    buffer = bytearray(maestro.addressed(bytes([maestro.GO_HOME]), 3) + maestro.get_errors())
+    buffer = bytearray(addressed(bytes([maestro.GO_HOME]), 3) + maestro.get_errors())
     assert maybe_command(buffer, device=4) == MaestroCommand(maestro.GET_ERRORS)
     buffer = bytearray(maestro.set_target(0, 6000)[:2] + maestro.set_target(1, 5000))
     assert maybe_command(buffer) == MaestroCommand(maestro.SET_TARGET, error=maestro.PROTOCOL_ERROR)

@@ -36,7 +36,7 @@ from sfms_robot.servo.chain.member import Member, Notices
 from sfms_robot.servo.chain.poll import TURN_S, StatusPoll
 from sfms_robot.servo.chain.settings import BUS_WATCHDOG, Settings
 from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup, needs_of, start_up
-from sfms_robot.servo.chain.telemetry import Telemetry
+from sfms_robot.servo.chain.telemetry import Telemetry, raw_type
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field
@@ -59,7 +59,7 @@ class ChainBus(WireBus[RegisterLink]):
     Args:
         name, servos, conversion, open_port, baud: see `WireBus`.
         read_deadline_s: time without a byte after which a servo counts as silent.
-        config: rate, watchdog and the like; `baud` and `read_deadline_s` are in force in place of its own.
+        config: rate, watchdog and the like; `baud` and `read_deadline_s` take the place of those in it.
         faults: which faults are acted upon.
 
     Attributes:
@@ -113,8 +113,7 @@ class ChainBus(WireBus[RegisterLink]):
         goal = self._telemetry.goal
         # Protocol 2.0 goals are encoded all at once; the others one by one, each checked against its sign rule.
         simple = self.maps[1] == 2 and goal.signed in ("no", "twos_complement")
-        kind = f"<{'u' if goal.signed == 'no' else 'i'}{goal.size}"
-        self._goal_type = np.dtype([("id", np.uint8), ("goal", kind)]) if simple else None
+        self._goal_type = np.dtype([("id", np.uint8), ("goal", raw_type(goal))]) if simple else None
         self._watchdog = math.ceil(config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
         self._wrote_s = math.inf
         self._fed: Indices | None = None  # places whose watchdogs are armed
@@ -282,7 +281,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._stop_members()
         self._update_places()
         link = self._link
-        if link is None and self._lost_s is not None:
+        if link is None and self._lost:
             link = self._open_again()  # perhaps it has just come back
         if link is None:
             return

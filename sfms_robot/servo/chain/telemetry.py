@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Ints, Reading
 from sfms_robot.ports import TickConversion
+from sfms_robot.servo.policy import tells_current
 from sfms_robot.servo.registers import Field, Table, span_of
 
 Block = tuple[int, int]  # address, length
@@ -68,31 +69,31 @@ class Telemetry:
         common(bus, tables, "bus_watchdog")
         # Angles are affine in ticks, so two conversions give the angle of one tick.
         zero, one = (conversion.to_rad(np.full(len(tables), ticks, np.int64)) for ticks in (0, 1))
-        loads = [_load(table) for table in tables]
+        # Protocol 2.0 has current or load at one address; the others have load, and perhaps a current in mA besides.
+        loads = [(protocol == 2 and table.role("present_current")) or table.role("present_load") for table in tables]
+        apart = [table.role("present_current") if protocol == 1 and tells_current(table) else None for table in tables]
+        currents = loads if protocol == 2 else apart
         speeds, voltages, temperatures = (
             [table.role(role) for table in tables] for role in ("present_speed", "voltage", "temperature")
         )
+        ticks_s = [table.in_ticks(field) if field else math.nan for table, field in zip(tables, speeds, strict=True)]
         sources = {  # row of `extra` -> register of each servo, and what its raw value is multiplied with
-            _CURRENT: (loads, _scales(loads, "mA")),
+            _CURRENT: (currents, _scales(currents, "mA")),
             _PERCENT: (loads, _scales(loads, "percent")),
-            _VELOCITY: (speeds, (one - zero) * np.array([_ticks_s(table) for table in tables])),
+            _VELOCITY: (speeds, (one - zero) * np.array(ticks_s)),
             _VOLTAGE: (voltages, _scales(voltages)),
             _TEMPERATURE: (temperatures, _scales(temperatures)),
         }
         shared = {row: field for row, (fields, _) in sources.items() if (field := _shared(fields)) is not None}
-        self._present = present, _raw_type(present)
+        self._present = present, raw_type(present)
         self.position: Block = (present.address, present.size)
         self.block = span_of([present, *shared.values()])
-        self.currents = [_apart(table, shared.get(_CURRENT)) for table in tables]
-        if self.currents.count(None) < len(tables):
-            shared.pop(_CURRENT, None)  # read servo by servo
-        if (current := _shared(self.currents)) is not None:
-            wider = span_of([present, *shared.values(), current])
-            if wider[1] - self.block[1] <= _REACH:
-                shared[_CURRENT], self.block = current, wider
-                sources[_CURRENT] = self.currents, _scales(self.currents)
-                self.currents = [None] * len(tables)
-        columns = [(field, _raw_type(field), row, sources[row][1]) for row, field in shared.items()]
+        near = span_of([present, *(field for row, field in shared.items() if row != _CURRENT)])
+        self.currents: list[Field | None] = [None] * len(tables)
+        if _CURRENT not in shared or self.block[1] - near[1] > _REACH:
+            shared.pop(_CURRENT, None)
+            self.block, self.currents = near, apart  # read servo by servo
+        columns = [(field, raw_type(field), row, sources[row][1]) for row, field in shared.items()]
         self._columns = [column for column in columns if np.isfinite(column[3]).any()]
         self.health = span_of([self.torque] if self.error is None else [self.torque, self.error])
         self._conversion = conversion
@@ -191,23 +192,13 @@ def _shared(fields: Sequence[Field | None]) -> Field | None:
     return fields[0] if all(_alike(field, fields[0]) for field in fields) else None
 
 
-def _load(table: Table) -> Field | None:
-    """Return current or load, which share an address in Dynamixel 2.0; the others have load, and perhaps a current."""
-    return (table.role("present_current") if table.protocol == 2 else None) or table.role("present_load")
-
-
-def _apart(table: Table, load: Field | None) -> Field | None:
-    current = table.role("present_current")
-    apart = current is not None and current.unit == "mA" and table.protocol != 2
-    return current if apart and current != load else None
-
-
 def _scales(fields: Sequence[Field | None], unit: str | None = None) -> Doubles:
     """Return the scale of each register; NaN for one that is missing, or has another unit."""
     return np.array([field.scale if field and unit in (None, field.unit) else math.nan for field in fields])
 
 
-def _raw_type(field: Field) -> np.dtype[Any]:
+def raw_type(field: Field) -> np.dtype[Any]:
+    """Return the type of the raw form of a register in an array."""
     kind = ("<", ">")[field.byte_order == "big"] + ("u", "i")[field.signed == "twos_complement"]
     return np.dtype(f"{kind}{field.size}")
 
@@ -223,11 +214,3 @@ def _values(field: Field, raw_type: np.dtype[Any], rows: bytes, where: Block) ->
         magnitude = wide & (bit - 1)
         return np.where(wide & bit, -magnitude, magnitude)
     return raw
-
-
-def _ticks_s(table: Table) -> float:
-    """Return ticks per second of one raw unit of speed, which is in rpm or in degrees per second."""
-    field = table.role("present_speed")
-    if field is None:
-        return math.nan
-    return field.scale * table.ticks_per_revolution / (60.0 if field.unit == "rpm" else 360.0)

@@ -109,16 +109,8 @@ def crc7(packet: bytes) -> int:
 
 
 def sealed(packet: bytes) -> bytes:
-    """Append the CRC to a command, compact or addressed."""
+    """Append the CRC to a command of either protocol."""
     return packet + bytes([crc7(packet)])
-
-
-def addressed(command: bytes, device: int = DEFAULT_DEVICE) -> bytes:
-    """Return a compact command in the Pololu protocol, for one of several boards on a wire.
-
-    [0] AA, [1] device number, [2] command byte with its top bit cleared, [3] on: its data.
-    """
-    return bytes([BAUD_INDICATION, device, command[0] & 0x7F]) + command[1:]
 
 
 def maybe_command(buffer: bytearray, device: int = DEFAULT_DEVICE, crc: bool = False) -> MaestroCommand | None:
