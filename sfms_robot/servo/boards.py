@@ -119,11 +119,6 @@ class BoardStatus(NamedTuple):
     lasting: bool = False  # the fault is in the board, not only in the bytes it received
     went_home: bool = False  # it has switched its channels off, or to wherever its home is
 
-    @property
-    def garbled(self) -> bool:
-        """Return whether the board reports only that bytes to it were damaged."""
-        return self.went_home and not self.lasting
-
 
 class PulseOutput:
     """The state of one channel of a board.
@@ -286,7 +281,7 @@ def answers(board: Maestro | Ssc32, wire: RateLimitedPort, tries: int = 2 * TRIE
     for _ in range(tries):
         answer = wire.exchange(board.status_request(restarted), board.status_length)
         status = None if answer is None else board.decode_status(answer)
-        if status is not None and not status.garbled:
+        if status is not None and (status.lasting or not status.went_home):  # no bytes to it were damaged
             return True
         restarted = status is None and not restarted
     return False

@@ -153,7 +153,7 @@ class WireBus(ABC, Generic[L]):
         self._forget_silence()
 
     def _forget_silence(self) -> None:
-        self._lost_s: float | None = None
+        self._lost = False  # the port, which was open
         self._tried_s = -math.inf
         self._answered_s: float | None = None
 
@@ -190,9 +190,9 @@ class WireBus(ABC, Generic[L]):
 
         Raises BusError if no servo has answered for so long that the bus has failed.
         """
-        if self._lost_s is not None:
+        if self._lost:
             self._reopen(now_s)
-        link = self._link if self._lost_s is not None else self._connected()
+        link = self._link if self._lost else self._connected()
         if link is not None:
             try:
                 if self._ask(link, now_s):
@@ -241,7 +241,7 @@ class WireBus(ABC, Generic[L]):
 
     def _check(self, enabled: bool) -> None:
         """Raise BusError before `connect`, ValueError before `enable`."""
-        if self._lost_s is None:
+        if not self._lost:
             self._connected()
         if not enabled:
             raise ValueError(f"bus {self.name!r}: no joint is enabled, goals are refused")
@@ -251,7 +251,7 @@ class WireBus(ABC, Generic[L]):
         self._counts["errors"] += 1
         if self._link is not None:
             self._link.port.close()
-        self._link, self._lost_s, self._tried_s = None, now_s, now_s
+        self._link, self._lost, self._tried_s = None, True, now_s
         self._left()
 
     def _reopen(self, now_s: float) -> None:
@@ -268,7 +268,7 @@ class WireBus(ABC, Generic[L]):
             self._link = self._open()
         except (PortError, BusError):
             return None  # still gone
-        self._lost_s = None
+        self._lost = False
         return self._link
 
 

@@ -152,12 +152,8 @@ def stable_name(device: str, root: Path = ROOT, listed: Callable[[], Iterable[An
 
 def holders(path: str, root: Path = ROOT) -> list[Holder]:
     """Return the processes that have the port open, as far as this user may see; this one is left out."""
-    real = os.path.realpath(path)
-    found = []
-    for folder in _processes(root):
-        if int(folder.name) != os.getpid() and any(target == real for target in _open_files(folder)):
-            found.append(Holder(int(folder.name), _command(folder)))
-    return found
+    real, others = os.path.realpath(path), [each for each in _processes(root) if int(each.name) != os.getpid()]
+    return [Holder(int(folder.name), _command(folder)) for folder in others if real in _open_files(folder)]
 
 
 def rivals(path: str, root: Path = ROOT) -> list[tuple[str, str]]:

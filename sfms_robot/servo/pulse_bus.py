@@ -254,7 +254,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _send_off(self, channels: Sequence[int], restarted: bool = False) -> None:
         """Send torque off over the open port, else over one opened for this: the bus's own may be in use."""
         wire = self._link
-        if not channels or (wire is None and self._lost_s is None):
+        if not channels or (wire is None and not self._lost):
             return
         if wire is not None:
             data = self._board.encode_off(channels, restarted or self._silent)
@@ -276,7 +276,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         for output in self._outputs:
             output.enabled = output.waiting = False
         self._pending = False
-        if policy == "hold" or not self._off or (self._link is None and self._lost_s is None):
+        if policy == "hold" or not self._off or (self._link is None and not self._lost):
             return
         wire = self._link or self._open_again()
         until_s = wire.port.now_s() + min(_STOP_S, within_s) if wire is not None else 0.0

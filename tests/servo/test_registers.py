@@ -1,5 +1,3 @@
-import pickle
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -57,12 +55,6 @@ def test_sign_rule_and_byte_order_are_the_models_own(table, name, value, raw):
 def test_value_that_does_not_fit_is_refused(table, name, value):
     with pytest.raises(OverflowError):
         table[name].to_bytes(value)
-
-
-@pytest.mark.parametrize("model", [*SERVOS, "xl-320", "maestro-24", "ssc-32"])
-def test_table_survives_the_pipe_to_an_emulator(model):
-    table = Table.of(load_firmware_map(model))
-    assert pickle.loads(pickle.dumps(table)) == table
 
 
 def test_faults_and_the_error_byte_name_what_is_the_servos():

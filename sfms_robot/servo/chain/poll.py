@@ -296,12 +296,12 @@ class StatusPoll:
     def _read_in_turn(self, ids: Sequence[int]) -> PollOutcome:
         """Read servos one by one, as many per poll as its share of a tick allows, from where the last poll ended."""
         out, where = PollOutcome(), self._telemetry.block
-        place = {servo: i for i, servo in enumerate(self._ids)}
-        order = sorted(ids, key=lambda servo: (place[servo] - self._turn) % len(place))
+        count = len(self._ids)
+        order = sorted(ids, key=lambda servo: (self._by_id[servo].index - self._turn) % count)
         for number, servo in enumerate(order[: self._many]):
             if number and not self.link.affords(self._bytes(1, where[1]), alone=True):
                 break
-            self._turn = (place[servo] + 1) % len(place)
+            self._turn = (self._by_id[servo].index + 1) % count
             self._counts["reads"] += 1
             if (answer := self.link.read(servo, *where)) is not None:
                 out.answers[servo] = answer
@@ -334,10 +334,9 @@ class StatusPoll:
         """Ask members that are not listed and have waited long enough, one by one, until one does not answer."""
         answered = False
         where = self._telemetry.position if self._grouped else self._telemetry.block
-        absent = [member for member in self._members if not member.listed]
-        waiting = [member for member in absent if member.probe_s <= now_s]
         request = self._bytes(1, self._telemetry.block[1])
         for _ in range(_PROBES):
+            waiting = [member for member in self._members if not member.listed and member.probe_s <= now_s]
             if not waiting or not self.link.grants("probe", request, alone=True, late_s=AWAY_LATE_S):
                 return answered
             member = min(waiting, key=lambda each: each.probe_s)
@@ -354,10 +353,9 @@ class StatusPoll:
             member.answered()
             self._missing.discard(member.id)
             self._take(where, {member.id: answer}, now_s)
-            absent.remove(member)
-            for other in absent:
-                other.hurry(now_s)
-            waiting = list(absent)
+            for other in self._members:
+                if not other.listed:
+                    other.hurry(now_s)
             self._take_health(self.read_some("health", self._telemetry.health, [member.id]), now_s)
             member.back(now_s)
         return answered

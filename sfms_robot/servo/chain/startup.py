@@ -42,7 +42,6 @@ from sfms_robot.servo.chain.link import TRIES, Found, RegisterLink, Silent, Step
 from sfms_robot.servo.policy import BusServo, torque_limit
 from sfms_robot.servo.registers import Field, Table, span_of
 from sfms_robot.servo.stored_settings import (
-    Contradiction,
     JointNeeds,
     contradictions,
     limit_names,
@@ -333,7 +332,9 @@ class Startup(ABC):
         found = contradictions(values, self.table, self._needs)
         for each in found:
             if each.then == "refused":
-                raise ServoError(f"{self.link.port.name}: servo {servo.id} ({servo.joint}): {each}{_cure(each, servo)}")
+                kept = f"measure the joint ({servo.calibrate}), or record the value if the head's file fits it: "
+                cure = f"; {kept * each.in_file}{servo.doctor}" * each.fixable
+                raise ServoError(f"{self.link.port.name}: servo {servo.id} ({servo.joint}): {each}{cure}")
             if each.then == "told" and servo.joint not in (joints := self._warnings.setdefault(str(each), [])):
                 joints.append(servo.joint)
                 if self.link.tries == 1:
@@ -405,11 +406,6 @@ class Startup(ABC):
 
 def _inside(ticks: int, limits: tuple[int, int]) -> bool:
     return limits[0] <= ticks <= limits[1]
-
-
-def _cure(found: Contradiction, servo: BusServo) -> str:
-    kept = f"measure the joint ({servo.calibrate}), or record the value if the head's file fits it: "
-    return f"; {kept * found.in_file}{servo.doctor}" if found.fixable else ""
 
 
 def start_up(bus: str, link: RegisterLink, startups: Sequence[Startup], baud: int) -> dict[int, int]:
