@@ -416,13 +416,6 @@ def plugged(
     ]
 
 
-def _wire(description: Mapping[str, Any]) -> EmulatedWire:
-    """Return the wire with its servos and faults."""
-    devices = plugged(description["servos"], description["tables"], description["behind_silent"] != "skip")
-    faults = [parse_fault(text) for text in description["faults"]]
-    return EmulatedWire(devices, description["timing"], faults, description["seed"])
-
-
 def _bound(description: Mapping[str, Any], folder: str) -> tuple[socket.socket, str, Callable[[str | None], Device]]:
     """Return the control socket, its address, and the function that opens the device."""
     if description["transport"] == "tcp":
@@ -440,7 +433,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     description = parent.receive()
     try:
-        wire = _wire(description)
+        devices = plugged(description["servos"], description["tables"], description["behind_silent"] != "skip")
+        faults = [parse_fault(text) for text in description["faults"]]
+        wire = EmulatedWire(devices, description["timing"], faults, description["seed"])
     except ConfigError as error:
         parent.send(error)
         return

@@ -242,32 +242,29 @@ class EmulatedWire:
         return [servo for servo in self._servos if hasattr(servo, "set_supply")]
 
     def _turn_faults(self, now_s: float) -> None:
+        """Let faults begin and end by `now_s`."""
         for time_s, fault, began in self.faults.edges(now_s):
-            self._happen(fault, began, time_s)
-
-    def _happen(self, fault: Fault, began: bool, now_s: float) -> None:
-        kind = fault.kind
-        concerned = [servo for servo in self._servos if fault.concerns(servo)]
-        if kind == "hangup":
-            self.hung = began
-            self._inbox.clear()
-            self._outbox.clear()
-        elif kind in ("voltage", "brownout"):
-            for servo in self._supplied:
-                usual_v = self._before_brownout.setdefault(servo.id, servo.supply_v)
-                servo.set_supply(fault.value if began else usual_v, now_s)
-            if not began:
-                self._before_brownout.clear()
-        for servo in concerned:
-            if kind == "silent" or (kind == "brownout" and not hasattr(servo, "set_supply")):
-                servo.dead = began
-            elif kind == "mute":
-                servo.mute = began
-            elif kind in ("stuck", "load"):
-                servo.advance(now_s)
-                setattr(servo.plant, kind, began if kind == "stuck" else fault.value * began)
-            elif kind in ("overload", "overheat") and began:
-                servo.fail(servo.fault_bits["overheating" if kind == "overheat" else kind], now_s)
-        if kind == "brownout":
-            for device in self._devices:
-                device.restart(now_s)  # a board without a supply makes no pulses either
+            kind = fault.kind
+            if kind == "hangup":
+                self.hung = began
+                self._inbox.clear()
+                self._outbox.clear()
+            elif kind in ("voltage", "brownout"):
+                for servo in self._supplied:
+                    usual_v = self._before_brownout.setdefault(servo.id, servo.supply_v)
+                    servo.set_supply(fault.value if began else usual_v, time_s)
+                if not began:
+                    self._before_brownout.clear()
+            for servo in filter(fault.concerns, self._servos):
+                if kind == "silent" or (kind == "brownout" and not hasattr(servo, "set_supply")):
+                    servo.dead = began
+                elif kind == "mute":
+                    servo.mute = began
+                elif kind in ("stuck", "load"):
+                    servo.advance(time_s)
+                    setattr(servo.plant, kind, began if kind == "stuck" else fault.value * began)
+                elif kind in ("overload", "overheat") and began:
+                    servo.fail(servo.fault_bits["overheating" if kind == "overheat" else kind], time_s)
+            if kind == "brownout":
+                for device in self._devices:
+                    device.restart(time_s)  # a board without a supply makes no pulses either

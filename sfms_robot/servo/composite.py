@@ -134,7 +134,6 @@ class CompositeBus:
         self._stops: list[threading.Thread] = []
         self._failures: dict[str, Exception] = {}  # by bus
         self._unreported: list[str] = []  # of them, those that `poll` has to raise
-        self._last: dict[str, Mapping[str, Reading]] = {}
         place = {joint: i for i, joint in enumerate(joints)}
         self._places = {name: np.array([place[j] for j in bus.joints], np.intp) for name, bus in buses.items()}
 
@@ -192,13 +191,11 @@ class CompositeBus:
         for name, bus in self._buses.items():
             if name not in self._failures:
                 try:
-                    self._last[name] = self._read(name, bus, now_s)
+                    readings |= self._read(name, bus, now_s)
                 except Exception as error:
                     self._fail(name, error)
             if name in self._failures:
                 readings |= {joint: Reading(None, float("inf"), FAILED) for joint in bus.joints}
-            else:
-                readings |= self._last[name]
         if self._unreported:
             name = self._unreported.pop(0)
             raise BusError(str(self._failures[name])) from self._failures[name]

@@ -285,8 +285,7 @@ class VirtualTimePort:
 
 def _open(device: str, baud: int) -> serial.Serial:
     """Open a device. Raises PortError of one line: missing, not permitted, held by another program, not serial."""
-    scheme = device.partition("://")[0] if is_address(device) else ""
-    if scheme and (problem := access_problem(device)):
+    if is_address(device) and (problem := access_problem(device)):
         raise PortError(f"{device}: {problem}")
     import serial
 
@@ -298,7 +297,7 @@ def _open(device: str, baud: int) -> serial.Serial:
         if _is_socket(device):  # With Nagle's algorithm the goals of a tick wait for the last acknowledgement: 40 ms.
             with socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as connection:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        elif not scheme:
+        elif not is_address(device):
             _claim(port, device)
             _check_baud(port, device)
     except BaseException:
@@ -330,8 +329,7 @@ def _claim(port: serial.Serial, device: str) -> None:
         return
     if _fcntl is not None:
         _fcntl.ioctl(port.fileno(), _termios.TIOCEXCL)
-    others = holders(device)
-    if others:
+    if others := holders(device):
         raise PortError(f"{device}: {_held(others)}")
 
 

@@ -147,5 +147,4 @@ def test_rubbish_moves_no_channel_out_of_its_limits(chunks, model):
         board.receive(chunk, 9600, now_s)
     board.advance(now_s + 1.0)
     shortest, longest = board.limits
-    for channel in board.channels:
-        assert channel.pulse == 0 or shortest <= channel.pulse <= longest
+    assert all(each.pulse == 0 or shortest <= each.pulse <= longest for each in board.channels)

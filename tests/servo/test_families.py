@@ -28,9 +28,6 @@ def test_a_family_that_cannot_be_had_is_one_line():
             BusFamily("Theirs", bus, ("theirs", None)).build("not a number")
 
 
-HERKULEX = BusFamily("HerkuleX", "collections:OrderedDict", ("herkulex", None))
-
-
 @pytest.fixture
 def installed(tmp_path, monkeypatch):
     """Another package in the path, with an entry point."""
@@ -54,7 +51,7 @@ def installed(tmp_path, monkeypatch):
 
 def test_family_of_another_package_is_there_by_its_name(installed):
     installed("herkulex = sfms_herkulex:FAMILY")
-    assert family_named("herkulex") == HERKULEX
+    assert family_named("herkulex") == BusFamily("HerkuleX", "collections:OrderedDict", ("herkulex", None))
 
 
 @pytest.mark.parametrize(

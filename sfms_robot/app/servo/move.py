@@ -59,8 +59,8 @@ def move(seen: FoundServo, to: str | None, by: str | None) -> Row:
             goal = finish(startup.torque_on(), lambda pause_s: clock.wait_until(clock.now_s() + pause_s))
             stays_on = was_on
         if speed is not None:  # twice that of the steps, so that the servo keeps up with them and does no more
-            per_unit = 6.0 if speed.unit == "rpm" else 1.0  # deg/s
-            seen.put(speed, min(speed.high, max(1, round(2.0 * SPEED_DEG_S / per_unit / speed.scale))))
+            raw = round(2.0 * _ticks(table, SPEED_DEG_S) / table.in_ticks(speed))
+            seen.put(speed, min(speed.high, max(1, raw)))
         due_s = clock.now_s()
         while goal != target:
             goal += max(-step, min(step, target - goal))

@@ -61,8 +61,6 @@ _LOOK_S: Final = 0.05  # between two looks at a servo that is moved inside its l
 _STILL_TICKS: Final = 1  # between two looks: it stands
 _AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the last registers of 2.0 that are read
 _BY_TIME: Final = 0x04  # drive mode bit 2: the profile registers are durations
-_DEG_S: Final = {"rpm": 6.0, "deg_per_s": 1.0}
-_DEG_S2: Final = {"rev_per_min2": 0.1, "deg_per_s2": 1.0}
 
 
 class WayInside(NamedTuple):
@@ -101,11 +99,10 @@ def slow_profile(table: Table, drive_mode: int, distance_deg: float) -> Mapping[
     if speed.name == "profile_velocity" and drive_mode & _BY_TIME:
         profile = {speed.name: max(1, round(1e3 * (distance_deg / SPEED_DEG_S + _RAMP_S)))}
         return profile if acceleration is None else {acceleration.name: round(1e3 * _RAMP_S / 2.0), **profile}
-    profile = {speed.name: max(1, int(SPEED_DEG_S / (speed.scale * _DEG_S[speed.unit])))}
+    ticks_s = SPEED_DEG_S / 360.0 * table.ticks_per_revolution
+    profile = {speed.name: max(1, int(ticks_s / table.in_ticks(speed)))}
     if acceleration is not None:
-        # Reach the speed in `_RAMP_S`, in units of the register.
-        raw = SPEED_DEG_S / _RAMP_S / (acceleration.scale * _DEG_S2[acceleration.unit])
-        profile[acceleration.name] = max(1, int(raw))
+        profile[acceleration.name] = max(1, int(ticks_s / _RAMP_S / table.in_ticks(acceleration)))
     return profile
 
 
