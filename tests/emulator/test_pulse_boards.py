@@ -146,5 +146,4 @@ def test_rubbish_moves_no_channel_out_of_its_limits(chunks, model):
         now_s += 0.01
         board.receive(chunk, 9600, now_s)
     board.advance(now_s + 1.0)
-    shortest, longest = board.limits
-    assert all(each.pulse == 0 or shortest <= each.pulse <= longest for each in board.channels)
+    assert all(each.pulse == 0 or board.limits[0] <= each.pulse <= board.limits[1] for each in board.channels)
