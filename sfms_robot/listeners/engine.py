@@ -126,12 +126,12 @@ class RunsOnEngine:
         raise NotImplementedError
 
     def told(self, controls: Sequence[Floats | None]) -> Floats:
-        """Return controls as of `step` of N streams (N, P + A, K); (N, 0, 0) without events.
+        """Return controls as of `step` of N streams (N, P + A, K), None being no event; (N, 0, 0) without events.
 
         Raises ValueError for another shape.
         """
         wanted = sum(self.control_frames), self.control_columns
-        rows = [np.zeros((0, 0), np.float32) if control is None else control for control in controls]
+        rows = [np.zeros(wanted, np.float32) if control is None else control for control in controls]
         for row in rows:
             if row.shape != wanted:
                 raise ValueError(f"control has shape {row.shape}, not {wanted}")

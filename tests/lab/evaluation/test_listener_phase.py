@@ -16,6 +16,7 @@ from sfms_robot.lab.evaluation.rollout import frames_of_dyad
 from sfms_robot.lab.learning.corpus import fit_sound
 from sfms_robot.lab.learning.sfms.features import SfmsCorpus, context, gather
 from sfms_robot.lab.learning.sfms.predictor_trainer import augment, keyframe_scores
+from sfms_robot.listeners.sfms.quantizer import Grid
 from sfms_robot.listeners.sfms.stream import SfmsListener
 
 OFF = {"steps": 1, "batch": 1, "learning_rate": 1, "neutral_prefix": 0, "drop_audio": 0, "drop_face": 0}
@@ -72,7 +73,7 @@ def augmented(**changes):
         seen = context(one.model, corpus, tokens, torch.tensor([0, 3, 8, 12]))
     training = config.parse(config.PredictorTraining, OFF | {"history_noise": 0} | changes, "tiny")
     neutral = torch.full((40, 2), 5)
-    return seen, augment(seen, torch.tensor([[5.0, 3.0], [2.0, 2.0]]), neutral, training, torch.Generator())
+    return seen, augment(seen, Grid([[5, 3], [2, 2]]), neutral, training, torch.Generator())
 
 
 def test_without_augmentation_nothing_changes():
