@@ -14,7 +14,8 @@ from sfms_robot.app.progress import tracked
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Bools, Doubles, Floats
-from sfms_robot.lab.corpora.clips import STATE, UNKNOWN, Dyad
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
 from sfms_robot.lab.evaluation.listener_tables import spread_clips
 from sfms_robot.lab.evaluation.phrase_timing import near
 from sfms_robot.lab.evaluation.rollout import Rollout, rollouts

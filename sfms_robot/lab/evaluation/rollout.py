@@ -26,7 +26,8 @@ from sfms_robot.app.progress import tracked
 from sfms_robot.config.listener import paper_state
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, SpeakerFrame
-from sfms_robot.lab.corpora.clips import UNKNOWN, Dyad
+from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.conversational_states import UNKNOWN
 from sfms_robot.lab.learning.sfms.features import frames_of, keyframe_tokens, place_all
 from sfms_robot.listeners.arig.stream import ArigMemory
 from sfms_robot.listeners.capacity import step_each

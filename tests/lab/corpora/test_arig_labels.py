@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sfms_robot.config.listener import STATES
-from sfms_robot.lab.corpora.clips import STATE, short_answers, states_of, states_of_activity
+from sfms_robot.lab.corpora.conversational_states import STATE, short_answers, states_of, states_of_activity
 
 # (agent speaks, user speaks) that a state may have.
 PATTERNS = {

@@ -34,7 +34,7 @@ from sfms_robot.app.progress import Progress, no_progress
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Bools, Doubles, Floats
-from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save, states_of
+from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
 from sfms_robot.lab.corpora.compose.ami import (
     LabelledSpan,
@@ -59,6 +59,7 @@ from sfms_robot.lab.corpora.compose.voices import (
     room,
     split_voices,
 )
+from sfms_robot.lab.corpora.conversational_states import states_of
 from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
 from sfms_robot.processes import process_pool
 from sfms_robot.signals import event_sizes as sizes

@@ -13,11 +13,12 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, MOTION_DIM, Floats
-from sfms_robot.lab.corpora.clips import Dyad, states_of_activity
+from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.compose.ami import LabelledSpan, LabelledSpans, MeetingPerson, interval_table
 from sfms_robot.lab.corpora.compose.motions import Rng, pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, room
+from sfms_robot.lab.corpora.conversational_states import states_of_activity
 from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
 from sfms_robot.signals.event_sizes import aside_s
 from sfms_robot.signals.events import runs

@@ -19,9 +19,9 @@ from sfms_robot import config
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, LATERAL_POSE, Floats
-from sfms_robot.lab.corpora.clips import UNKNOWN
 from sfms_robot.lab.corpora.clips import Dyad as Conversation
 from sfms_robot.lab.corpora.collection import Dataset
+from sfms_robot.lab.corpora.conversational_states import UNKNOWN
 from sfms_robot.lab.corpora.formats import open_dataset
 from sfms_robot.lab.learning import corpus as dyads
 from sfms_robot.lab.learning.corpus import (
