@@ -21,7 +21,7 @@ from sfms_robot.app.open_head import build_bus
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
 from sfms_robot.emulator.launch import launch
-from sfms_robot.lab.bench.measure import HEAD, Row, row, times
+from sfms_robot.lab.bench.measure import HEAD, Row, Rows, row, times
 from sfms_robot.runtime.clock import RealClock, tick_times
 
 RATE_HZ: Final = 100.0
@@ -42,7 +42,7 @@ class Host:
     tick: Callable[[], object]
 
 
-def bus() -> dict[str, Row]:
+def bus() -> Rows:
     """Return all rows; ours first, then the vendor SDK on the same servos."""
     head = load_head(HEAD)
     patient = head.buses["main"].model_copy(update={"read_deadline_ms": DEADLINE_MS})
@@ -50,7 +50,7 @@ def bus() -> dict[str, Row]:
     return {**_cpu(head), "bus.one_silent": _one_silent(head)}
 
 
-def _cpu(head: Head) -> dict[str, Row]:
+def _cpu(head: Head) -> Rows:
     def measured(host: Host) -> list[list[float]]:
         calls = [times(call, _CALLS, time.process_time) for call in (host.write, host.tick)]
         return [*calls, _paced(host)[1]]

@@ -24,7 +24,7 @@ import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from sfms_robot.config import load_firmware_map
 from sfms_robot.emulator.faults import KINDS
 from sfms_robot.emulator.launch import EmulatedServo
 from sfms_robot.errors import BusError, ServoError
+from sfms_robot.lab import Figures
 from sfms_robot.lab.bench.campaign_rig import (
     FAMILIES,
     LIMIT_DEG,
@@ -179,7 +180,7 @@ def corrupted_bytes(outcomes: Sequence[CaseOutcome]) -> dict[str, dict[str, str]
     }
 
 
-def table(outcomes: Sequence[CaseOutcome]) -> list[dict[str, Any]]:
+def table(outcomes: Sequence[CaseOutcome]) -> list[Figures]:
     """Return a row per run, as printed."""
 
     def short(value: float | None) -> float | None:
@@ -232,7 +233,7 @@ def _found(servos: Sequence[EmulatedServo], case: str) -> list[EmulatedServo]:
     """Return the servos, two of them unlike the head's file; none if the family cannot be in that condition."""
     table = load_firmware_map(servos[0].model)
     turn = round(table.ticks_per_revolution)
-    changes: list[dict[str, Any]]
+    changes: list[Figures]
     if case == OUTSIDE:
         beyond = round((LIMIT_DEG + _OUTSIDE_DEG) / 360.0 * table.ticks_per_revolution)
         changes = [{"start_ticks": table.center_ticks + sign * beyond} for sign in (1, -1)]

@@ -15,6 +15,7 @@ from sfms_robot.config import Head, load_firmware_map
 from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Reading
+from sfms_robot.lab import Figures
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.ports import Bus
 from sfms_robot.runtime.clock import VirtualClock
@@ -62,14 +63,14 @@ def head_of(family: str, reconnect_s: float | None = None) -> Head:
         raise ConfigError.at("campaign", "family", family, "is not a family", FAMILIES)
     kind, model, ids, baud, checksum = FAMILIES[family]
     center = load_firmware_map(model).center_ticks
-    bus: dict[str, Any] = {"family": kind, "baud": baud, "rate_hz": RATE_HZ, "crc": checksum == "CRC-7"}
+    bus: Figures = {"family": kind, "baud": baud, "rate_hz": RATE_HZ, "crc": checksum == "CRC-7"}
     names = ["main"] * len(ids)
     if reconnect_s is not None:
         bus["reconnect_s"] = reconnect_s
         names[2:] = ["other", "other"]
     joint = {"model": model, "zero_ticks": center, "limits": "all"}
     reach = {"min_deg": -LIMIT_DEG, "max_deg": LIMIT_DEG}
-    plain: dict[str, Any] = {
+    plain: Figures = {
         "name": "campaign",
         "description": f"four {model}",
         "buses": dict.fromkeys(names, bus),
@@ -103,7 +104,12 @@ class Rig:
         """Do one turn of the loop: limiter, write, poll; a joint that rejoined continues from its position."""
         self.clock.wait_until(self.clock.now_s() + 1.0 / RATE_HZ)
         now_s = self.clock.now_s()
-        self.goals, self._state = self._limiter.step(self._wave(now_s - self._began_s), self._state)
+        turn = 2 * math.pi / _WAVE_S
+        phase = turn * (now_s - self._began_s)
+        way = np.where(np.arange(len(self.ids)) % 2, -1.0, 1.0) * _WAVE_RAD
+        angle = self._centre + way * math.sin(phase)  # a wave that begins at rest at the held angles
+        wave = np.array([angle, way * turn * math.cos(phase), -way * turn * turn * math.sin(phase)])
+        self.goals, self._state = self._limiter.step(wave, self._state)
         self.bus.write(self.goals, now_s)
         readings = self.bus.poll(now_s)
         back = np.array([reading.rejoined for reading in readings.values()])
@@ -114,14 +120,6 @@ class Rig:
             ]
             self._state = self._limiter.restart(back, np.array(stands), self._state)
         return readings
-
-    def _wave(self, time_s: float) -> Doubles:
-        """Return angle, speed, acceleration (3, J) of a wave that begins at rest at the held angles."""
-        turn = 2 * math.pi / _WAVE_S
-        phase = turn * time_s
-        way = np.where(np.arange(len(self.ids)) % 2, -1.0, 1.0) * _WAVE_RAD
-        angle = self._centre + way * math.sin(phase)
-        return np.array([angle, way * turn * math.cos(phase), -way * turn * turn * math.sin(phase)])
 
     def try_bad_goals(self, withheld: bool) -> None:
         """Send bad goals of the last joint. Raises AssertionError for one that the bus accepts.
@@ -137,7 +135,7 @@ class Rig:
                 self.bus.write(np.array([*self.goals[:-1], bad]), self.clock.now_s())
                 raise AssertionError(f"a goal of {bad:g} rad is not refused")
 
-    def states(self) -> list[dict[str, Any]]:
+    def states(self) -> list[Figures]:
         """Return the state of every servo now, read past the bus."""
         for chain in self.chains.values():
             chain.time_is(self.clock.now_s())
@@ -175,10 +173,19 @@ class Judge:
                 if rig.tick_us:
                     self.pulses_us.append(state["pulse"] * rig.tick_us)
         for index, reading in enumerate(readings.values()):
-            self.stale += self._misdated(index, reading)
+            if reading.position_rad is not None and math.isfinite(reading.age_s):
+                back = round(reading.age_s * RATE_HZ)
+                if back < len(self._shafts):  # else from before the first tick
+                    was_rad = self._shafts[-1 - back][index]  # at the time that the reading states
+                    self.stale += bool(abs(reading.position_rad - was_rad) > self._slack_rad[index])
         seen = [(i, joint, r) for i, (joint, r) in enumerate(readings.items()) if i not in self.away]
         self.named = [f"{joint}: {r.fault}" for _, joint, r in seen if r.fault is not None]
-        fine = [self._well(i, r, states[i], shafts[i]) for i, _, r in seen]
+        follows = np.abs(shafts - rig.goals) < _FOLLOWS_RAD
+        fine = [
+            r.fault is not None  # out, with a stated reason
+            or ((rig.tick_us or r.age_s < _FRESH_S) and states[i]["torque"] and follows[i])
+            for i, _, r in seen
+        ]
         if not all(fine):
             self.well_since_s = None
         elif self.well_since_s is None:
@@ -187,21 +194,6 @@ class Judge:
     def recovered_s(self, end_s: float) -> float | None:
         """Return the time from `end_s`, the end of the fault, until all was well for good; None if it never was."""
         return None if self.well_since_s is None else max(0.0, self.well_since_s - end_s)
-
-    def _misdated(self, index: int, reading: Reading) -> bool:
-        """Return whether the servo was elsewhere at the time that the reading states."""
-        if reading.position_rad is None or not math.isfinite(reading.age_s):
-            return False
-        back = round(reading.age_s * RATE_HZ)
-        if back >= len(self._shafts):
-            return False  # from before the first tick
-        return bool(abs(reading.position_rad - self._shafts[-1 - back][index]) > self._slack_rad[index])
-
-    def _well(self, index: int, reading: Reading, state: Mapping[str, Any], shaft_rad: float) -> bool:
-        if reading.fault is not None:
-            return True  # out, with a stated reason
-        known = self._rig.tick_us or reading.age_s < _FRESH_S
-        return bool(known) and state["torque"] and abs(shaft_rad - self._rig.goals[index]) < _FOLLOWS_RAD
 
 
 @contextmanager
@@ -215,20 +207,18 @@ def plugged_in(
     with ExitStack() as stack:
         plugged = (emulated(head) if servos is None else servos).items()
         chains = {name: stack.enter_context(launch(each, virtual=True)) for name, each in plugged}
-        bus = build_bus(head, chains, clock, confirmed=True) if wrap is None else _bus_on(head, chains, clock, wrap)
+        if wrap is None:
+            bus = build_bus(head, chains, clock, confirmed=True)
+        else:
+            [(name, config)] = head.buses.items()
+            open_port, family = port_of(chains[name], config, clock), family_named(config.family)
+            more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
+            bus = family.build(
+                name, bus_servos(head, head.joints), calibration_of(head.joints), lambda: wrap(open_port()),
+                config.baud, _DEADLINE_S, config=config, **more,
+            )  # fmt: skip
         try:
             yield Rig(head, chains, clock, bus)
         finally:
             bus.stop("release")
             bus.close()
-
-
-def _bus_on(head: Head, chains: Mapping[str, Chain], clock: VirtualClock, wrap: Callable[[Port], Port]) -> Bus:
-    [(name, config)] = head.buses.items()
-    open_port, family = port_of(chains[name], config, clock), family_named(config.family)
-    more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
-    bus: Bus = family.build(
-        name, bus_servos(head, head.joints), calibration_of(head.joints), lambda: wrap(open_port()), config.baud,
-        _DEADLINE_S, config=config, **more,
-    )  # fmt: skip
-    return bus

@@ -27,7 +27,8 @@ from sfms_robot.app.options import RunOptions
 from sfms_robot.app.session import run
 from sfms_robot.data import data_dir
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, POSE_CHANNELS, FaceFrame, SpeakerFrame
-from sfms_robot.lab.bench.measure import HEAD, BenchResult, Row, listener_process, percentiles, row
+from sfms_robot.lab import Figures
+from sfms_robot.lab.bench.measure import HEAD, BenchResult, Row, Rows, listener_process, percentiles, row
 from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.engine import FOLDER, EngineName, has_graphs, read_graphs
 from sfms_robot.listeners.process import threads
@@ -50,7 +51,7 @@ _COLUMNS: Final = {
 def listener() -> BenchResult:
     """Measure all listeners, on one thread each."""
     one_thread()
-    rows: dict[str, Row] = {}
+    rows: Rows = {}
     for name in NAMES:
         with tempfile.TemporaryDirectory() as scratch:
             rows |= _measured(name, Path(scratch))
@@ -60,7 +61,7 @@ def listener() -> BenchResult:
     )
 
 
-def engine_table(rows: Mapping[str, Row]) -> list[dict[str, Any]]:
+def engine_table(rows: Mapping[str, Row]) -> list[Figures]:
     """Return one line per engine; the row of a listener repeats one of these."""
     found = []
     for name, each in rows.items():
@@ -71,7 +72,7 @@ def engine_table(rows: Mapping[str, Row]) -> list[dict[str, Any]]:
     return found
 
 
-def _measured(name: str, scratch: Path) -> dict[str, Row]:
+def _measured(name: str, scratch: Path) -> Rows:
     """Return the rows of one shipped listener."""
     folder, weights = with_weights(name, scratch)
     settings = config.load_listener(folder / "config.yaml")
@@ -118,7 +119,7 @@ def with_weights(name: str, scratch: Path) -> tuple[Path, str]:
     return folder, SEEDED
 
 
-def _sfms_paper() -> dict[str, Row]:
+def _sfms_paper() -> Rows:
     """Measure the paper's size of SFMS with seeded weights, on torch."""
     import torch
 
@@ -176,7 +177,7 @@ def talk(frames: int = 100) -> list[SpeakerFrame]:
     return out
 
 
-def in_run(folder: Path, duration_s: float = 8.0) -> dict[str, Any]:
+def in_run(folder: Path, duration_s: float = 8.0) -> Figures:
     """Drive `HEAD` on emulated servos with the listener in `folder`, which hears both tracks, in real time.
 
     The loop must not be late because of the listener, and a step must not take longer than the 40 ms of a frame.

@@ -41,6 +41,7 @@ from sfms_robot.emulator.phone import EmulatedPhone
 from sfms_robot.emulator.sound_server import SoundServer
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, Plan, SpeakerFrame
+from sfms_robot.lab import Figures
 from sfms_robot.lab.bench.measure import (
     HEAD,
     LISTENER,
@@ -108,7 +109,7 @@ def live(minutes: float, audio: Audio, say: Say) -> BenchResult:
     return BenchResult({**result, "goals": found}, table, _lines(result))
 
 
-def idle_loop(duration_s: float) -> dict[str, Any]:
+def idle_loop(duration_s: float) -> Figures:
     """Measure the jitter of a loop of 100 Hz that does nothing, at the priority of a run, and the load. Blocks."""
     clock, late_ms = RealClock(), Quantiles()
     with realtime_priority(wanted=True) as priority:
@@ -125,7 +126,7 @@ def load() -> float:
     return round(os.getloadavg()[0], 2)
 
 
-def goals(result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def goals(result: Figures) -> dict[str, Figures]:
     """Return each of `GOALS` with the measured figure and whether it is met; None where it was not measured."""
     live = result["live"]
     came = {
@@ -146,7 +147,7 @@ def goals(result: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
-def _lines(result: Mapping[str, Any]) -> Sequence[str]:
+def _lines(result: Figures) -> Sequence[str]:
     live, idle, file = result["live"], result["idle"], result["file"]
     stages = ", ".join(f"{name} {ms['p50']}/{ms['p95']}" for name, ms in live["stages_ms"].items())
     busy = "; other programs use this machine too, so the figures mean little" if idle["busy"] else ""
@@ -242,7 +243,7 @@ class Stamps(Observer):
                     self._stages[name].add(max(0.0, part_s) * 1e3)
                 self._sound.add(max(0.0, written_s - sample_s) * 1e3)
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> Figures:
         """Return `ticks`, `missed_ticks`, `sound_to_goal_ms`, `stages_ms` and `face_to_goal_ms`."""
         due = 0 if self._first_s is None else round((self._last_s - self._first_s) * self._rate_hz) + 1
         return {
@@ -349,13 +350,13 @@ def _talk(server: SoundServer, over: threading.Event) -> None:
 # --- the run, in a separate process ---------------------------------------------------------------------------------
 
 
-def _run(environment: Mapping[str, str], **options: Any) -> dict[str, Any]:
+def _run(environment: Mapping[str, str], **options: Any) -> Figures:
     """Run `measured_run` in a process. Raises BusError with its last message if it fails."""
     done = subprocess.run(
         [sys.executable, "-P", "-c", _CHILD, json.dumps(options)],
         env={**package_environment(), **environment}, capture_output=True, text=True, check=False,
     )  # fmt: skip
-    found: dict[str, Any] = result_of(done.returncode, done.stderr, done.stdout, "live")
+    found: Figures = result_of(done.returncode, done.stderr, done.stdout, "live")
     return found
 
 

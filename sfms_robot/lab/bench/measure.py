@@ -21,13 +21,15 @@ import numpy as np
 
 from sfms_robot.errors import BusError, ConfigError, ModelError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.lab import Figures
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.processes import cores
 
 HEAD: Final = "face28"
 LISTENER: Final = "sfms-small"
-Row = dict[str, Any]
+Row = Figures
+Rows = dict[str, Row]  # by name
 Say = Callable[[str], None]  # prints a line of progress
 # -P: the current folder of the caller must not shadow the installation that is measured.
 MAIN: Final = ("-P", "-c", "from sfms_robot.cli.main import main; main()")
@@ -51,7 +53,7 @@ class BenchResult:
         passed: False makes the exit code 1.
     """
 
-    figures: dict[str, Any]
+    figures: Figures
     table: Sequence[Mapping[str, Any]]
     lines: Sequence[str] = ()
     passed: bool = True
@@ -124,7 +126,7 @@ def environment(folder: Path) -> Mapping[str, str]:
     return {**os.environ, "PYTHONPATH": str(folder.resolve())}
 
 
-def compare_installations(name: str, against: Path) -> dict[str, Row]:
+def compare_installations(name: str, against: Path) -> Rows:
     """Run `bench NAME` of this installation and of the one in `against` in turn; return the rows that both have.
 
     Raises ConfigError if the other installation does not run, or the bench has no rows.
@@ -181,8 +183,8 @@ def memory_mb(key: Literal["VmRSS", "VmHWM"], pid: int | Literal["self"] = "self
     try:
         lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
     except OSError:
-        return float("nan")
-    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{key}:")), float("nan"))
+        return np.nan
+    return next((int(line.split()[1]) / 1024 for line in lines if line.startswith(f"{key}:")), np.nan)
 
 
 def children_of(pid: int) -> list[int]:

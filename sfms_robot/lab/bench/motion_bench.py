@@ -30,7 +30,7 @@ from sfms_robot.config import Head, load_head
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import BusError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, POSE, Bools, Doubles, Floats, Plan, SpeakerFrame
-from sfms_robot.lab.bench.measure import HEAD, ResidentMemory, Row, row, times
+from sfms_robot.lab.bench.measure import HEAD, ResidentMemory, Rows, row, times
 from sfms_robot.motion.limits import difference
 from sfms_robot.ports import Clock, Observer, Tick
 from sfms_robot.runtime.clock import IDLE_FEED
@@ -106,7 +106,7 @@ class _Shafts(Observer):
         self.angles_rad.append(self._calibration.to_rad(np.array(ticks)))
 
 
-def lead(head: str = HEAD) -> dict[str, Row]:
+def lead(head: str = HEAD) -> Rows:
     """Return rows of the delay of each joint with lead [ms]; the peer is the delay without."""
     joints, *both_s = delays(head)
     moved = np.isfinite(both_s[0])
@@ -171,7 +171,7 @@ def delay_ticks(meant: Doubles, seen: Doubles, farthest: int) -> Doubles:
     return np.where(moved, best - farthest + between, np.nan)
 
 
-def memory(hours: float = 4.0, head: str = "interbotix_wxxms") -> dict[str, Row]:
+def memory(hours: float = 4.0, head: str = "interbotix_wxxms") -> Rows:
     """Return the growth of resident memory after the first hour [MB], beside the memory then; Linux only.
 
     `head`: a name or a folder; the usual one has two servos, so that hours pass quickly. Raises BusError if the run
@@ -188,7 +188,7 @@ def memory(hours: float = 4.0, head: str = "interbotix_wxxms") -> dict[str, Row]
     return {"memory.growth": row([settled[-1] - settled[0]], [settled[0]], "MB", "resident after the first hour")}
 
 
-def retarget() -> dict[str, Row]:
+def retarget() -> Rows:
     """Return rows of CPU time: `retarget.tick` = mapping + limits + calibration, each of these, and the timeline."""
     head = load_head(HEAD)
     motion = build_motion(head, _RETARGET_HZ)

@@ -28,6 +28,7 @@ import numpy as np
 from sfms_robot.app.serve.batch_process import Served
 from sfms_robot.app.serve.service import WorkerPool
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, SpeakerFrame
+from sfms_robot.lab import Figures
 from sfms_robot.lab.bench.listener_bench import NAMES, with_weights
 from sfms_robot.lab.bench.measure import BenchResult, Say, machine
 from sfms_robot.listeners.engine import Device
@@ -76,7 +77,7 @@ def measure(say: Say, device: Device = "cpu") -> BenchResult:
 
 def _on_gpu(say: Say, device: Device) -> BenchResult:
     """Measure listeners at fixed numbers of heads. Raises ConfigError where there is no GPU."""
-    table, messages, where = list[dict[str, Any]](), _frames(), machine()
+    table, messages, where = list[Figures](), _frames(), machine()
     for name in GPU_NAMES:
         listener = load_listener(name, threads=1, device=device)
         where = f"{engine_name(listener)}, {machine()}"
@@ -123,8 +124,8 @@ def _batch_ms(listener: Any, heads: int) -> dict[str, float]:
     return {"batch_ms": batch_ms, "networks_ms": networks_ms}
 
 
-def _served(name: str, say: Say) -> dict[str, Any]:
-    messages, curve = _frames(), list[dict[str, Any]]()
+def _served(name: str, say: Say) -> Figures:
+    messages, curve = _frames(), list[Figures]()
     with tempfile.TemporaryDirectory() as scratch:
         folder, weights = with_weights(name, Path(scratch))
         load = _Load()
@@ -186,7 +187,7 @@ def _largest(in_time: Callable[[int], bool], start: int) -> int:
     return low
 
 
-def _loaded(pool: WorkerPool, load: _Load, messages: Sequence[bytes], heads: int) -> dict[str, Any]:
+def _loaded(pool: WorkerPool, load: _Load, messages: Sequence[bytes], heads: int) -> Figures:
     """Measure one point of the curve: `heads` heads for `_SECONDS`."""
     streams = [_join(pool, index) for index in range(heads)]
     load.begin()

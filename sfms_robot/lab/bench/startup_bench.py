@@ -22,7 +22,7 @@ import numpy as np
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
-from sfms_robot.lab.bench.measure import HEAD, MAIN, Row, environment, memory_mb, row
+from sfms_robot.lab.bench.measure import HEAD, MAIN, Rows, environment, memory_mb, row
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 _REPEATS: Final = 5
@@ -30,7 +30,7 @@ _RUN_S: Final = 1.0
 _LOOK_S: Final = 0.004
 
 
-def startup(against: Path | None = None) -> dict[str, Row]:
+def startup(against: Path | None = None) -> Rows:
     """Return all rows; their peer is the installation in folder `against`, else a bare Python."""
     peer = "python -c pass" if against is None else str(against)
     other = None if against is None else environment(against)
@@ -39,7 +39,7 @@ def startup(against: Path | None = None) -> dict[str, Row]:
         "wrong_port": ["run", "--port", "/dev/ttyNOBODY", "--duration", "1"],
         "wrong_head": ["run", "--head", "nobody", "--duration", "1"],
     }
-    rows: dict[str, Row] = {}
+    rows: Rows = {}
     for name, words in ended.items():
         ours, theirs = [], []
         for _ in range(_REPEATS):
@@ -77,7 +77,7 @@ def start_and_end(
     head = load_head(HEAD)
     with launch(emulated(head)["main"]) as chain:
         words = ["run", "--head", HEAD, "--port", chain.device, "--duration", str(_RUN_S), "--seed", "1", "--json"]
-        servo, count, resident_mb, goal_s = chain.servos[-1].id, 0, 0.0, float("nan")
+        servo, count, resident_mb, goal_s = chain.servos[-1].id, 0, 0.0, np.nan
         began_s = byte_s = time.monotonic()
         process = subprocess.Popen(
             [sys.executable, *MAIN, *words, *more], env=env, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL

@@ -55,6 +55,7 @@ from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.runtime.states import ARROWS
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
+Process = subprocess.Popen[bytes]
 Change = tuple[float, str, tuple[str, ...]]  # time_s, state, why
 
 SHARE: Final = 0.25
@@ -65,6 +66,7 @@ _LIMIT_S: Final = 120.0  # for a run and its start
 _OUTSIDE_S: Final = 2.0  # more time to ease in, for joints found outside their range
 _SLICE_S: Final = 0.008  # not a multiple of a tick, so that ticks meet different places of a slice
 _PROCESSES_S: Final = 0.2  # between two looks for new processes
+OUT, SAID = "out", "said"  # files
 _CHILD: Final = "from sfms_robot.lab.bench.throttle_bench import observed_run; observed_run()"
 
 
@@ -154,27 +156,16 @@ def state_problems(changes: Sequence[Change], plans_s: Sequence[tuple[float, flo
     if len(changes) > 1 and changes[0][1] == "starting" and changes[1][0] - changes[0][0] > easing_s:
         found.append(f"starting for {changes[1][0] - changes[0][0]:.1f} s, {easing_s:g} at most")
     ends_s = [at_s for at_s, _, _ in changes[1:]] + [float("inf")]
-    for since_s, until_s in _silences(changes, plans_s):
-        if not any(
+    over_s = [at_s for at_s, name, _ in changes if name in ("stopping", "stopped", "fault")][:1]
+    in_time_s = [came_s for place, (came_s, last_s) in enumerate(plans_s) if not place or came_s <= last_s]
+    for since_s, until_s in pairwise([*in_time_s, *over_s] if plans_s else ()):
+        # A late plan shows that the listener is late only when it arrives, so the limit is the sum of both times.
+        if until_s - since_s > HUNG_S + LATE_S + _TOLERANCE_S and not any(
             "listener" in why and at_s <= until_s and end_s >= since_s
             for (at_s, _, why), end_s in zip(changes, ends_s, strict=True)
         ):
             found.append(f"no plan in time from {since_s:.2f} to {until_s:.2f} s, and the listener is not named")
     return found
-
-
-def _silences(changes: Sequence[Change], plans_s: Sequence[tuple[float, float]]) -> Iterator[tuple[float, float]]:
-    """Yield the times from a plan in time to the next, after the first plan, that are too long to stay unnamed.
-
-    A late plan shows that the listener is late only when it arrives, so the limit is the sum of both times.
-    """
-    if not plans_s:
-        return
-    ends_s = next(at_s for at_s, name, _ in changes if name in ("stopping", "stopped", "fault"))
-    in_time_s = [plans_s[0][0], *(came_s for came_s, last_s in plans_s[1:] if came_s <= last_s), ends_s]
-    for before_s, next_s in pairwise(in_time_s):
-        if next_s - before_s > HUNG_S + LATE_S + _TOLERANCE_S:
-            yield before_s, next_s
 
 
 # --- a run ----------------------------------------------------------------------------------------------------------
@@ -185,18 +176,14 @@ def _observed(share: float | None) -> ObservedRun:
     with TemporaryDirectory() as name, launch(emulated(load_head(HEAD))["main"]) as chain:
         folder, goals = Path(name), _Goals(chain)
         words = ["-P", "-c", _CHILD, json.dumps({"head": str(patient_head(folder)), "port": chain.device})]
-        with (
-            (folder / "out").open("wb") as out,
-            (folder / "said").open("wb") as said,
-            held(words, share, stdin=subprocess.DEVNULL, stdout=out, stderr=said, env=package_environment()) as process,
-        ):
+        with held(words, share, folder, package_environment()) as process:
             ends_s = time.monotonic() + _LIMIT_S
             while process.poll() is None:
                 if time.monotonic() > ends_s:
                     raise BusError(f"bench throttle: the run has not ended after {_LIMIT_S:g} s")
                 goals.look()
                 time.sleep(_LOOK_S)
-        printed, errors = ((folder / file).read_text(encoding="utf-8") for file in ("out", "said"))
+        printed, errors = ((folder / file).read_text(encoding="utf-8") for file in (OUT, SAID))
         found = result_of(process.returncode, errors, printed, "throttle")
         torque = [servo.id for servo in chain.servos if chain.state(servo.id)["torque"]]
     return ObservedRun(**found, looks=goals.looks, outside=goals.outside, torque=torque)
@@ -279,18 +266,27 @@ def processes_of(pid: int) -> list[int]:
 
 
 @contextmanager
-def held(arguments: Sequence[str], share: float | None, **popen: Any) -> Iterator[subprocess.Popen[bytes]]:
+def held(
+    arguments: Sequence[str], share: float | None, folder: Path, environment: Mapping[str, str]
+) -> Iterator[Process]:
     """Run `sys.executable ARGUMENTS`, held with all its descendants to a share of one core; kill it on leaving.
 
     Args:
         arguments: The command.
         share: Share of a core; None: no limit.
-        popen: Options of `subprocess.Popen`.
+        folder: What the command prints goes into its files `OUT` and `SAID` (stderr).
+        environment: Of the command.
     """
     cores = os.sched_getaffinity(0)
     first = {min(cores)}
-    with _on_cores(cores if share is None else first):
-        process = subprocess.Popen([sys.executable, *arguments], **popen)
+    with (
+        _on_cores(cores if share is None else first),
+        (folder / OUT).open("wb") as out,
+        (folder / SAID).open("wb") as said,
+    ):
+        process = subprocess.Popen(
+            [sys.executable, *arguments], stdin=subprocess.DEVNULL, stdout=out, stderr=said, env=environment
+        )
     over = threading.Event()
     thread = threading.Thread(target=_hold, args=(process, share or 1.0, cores - first, over), daemon=True)
     if share is not None:
@@ -305,7 +301,7 @@ def held(arguments: Sequence[str], share: float | None, **popen: Any) -> Iterato
         process.wait()
 
 
-def _hold(process: subprocess.Popen[bytes], share: float, cores: set[int], over: threading.Event) -> None:
+def _hold(process: Process, share: float, cores: set[int], over: threading.Event) -> None:
     """Stop and continue a process and its descendants in slices until the end; leave them running."""
     pids, looked_s, begins_s = [process.pid], 0.0, time.monotonic()
 

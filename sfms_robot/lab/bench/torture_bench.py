@@ -21,7 +21,7 @@ import signal
 import subprocess
 import time
 import urllib.request
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,6 +35,7 @@ from sfms_robot.app.wiring import emulated
 from sfms_robot.config import Head, load_head
 from sfms_robot.emulator.launch import Chain, launch
 from sfms_robot.errors import BusError
+from sfms_robot.lab import Figures
 from sfms_robot.lab.bench.live_bench import (
     SINK,
     Audio,
@@ -48,7 +49,7 @@ from sfms_robot.lab.bench.live_bench import (
     patient_head,
 )
 from sfms_robot.lab.bench.measure import HEAD, LISTENER, MAIN, BenchResult, Say, children_of, package_environment
-from sfms_robot.lab.bench.throttle_bench import held
+from sfms_robot.lab.bench.throttle_bench import OUT, SAID, Process, held
 
 KINDS: Final = ("killed", "stopped", "cut", "unplugged")
 LONGEST_S: Final = {"killed": 1.0, "stopped": 1.0, "cut": 1.0, "unplugged": 1.5}
@@ -88,26 +89,13 @@ class Blow:
 
 
 def measure(say: Say, minutes: float = 0.0, audio: Audio = "mic", torture: bool = False) -> BenchResult:
-    """Measure a live run, with faults if `torture`. 0 minutes: the usual length."""
-    if not torture:
-        return live(minutes, audio, say)
-    result = tortured(minutes or _MINUTES, audio, say)
-    missed = result["missed_ticks"]
-    lines = [
-        f"load {result['load']}, an empty loop has a jitter p99 of {result['idle']['jitter_ms']['p99']} ms",
-        f"{result['ticks']} ticks; missed within {_AFTER_S:g} s of a blow {missed['after_a_blow']}, otherwise "
-        f"{missed['otherwise']}; torque left on: {result['torque_left_on'] or 'none'}; the run ended: {result['exit']}",
-        "passed" if result["passed"] else "not passed",
-    ]
-    table = [{"what": kind, **row} for kind, row in result["counts"].items()]
-    return BenchResult(result, table, lines, result["passed"])
-
-
-def tortured(minutes: float, audio: Audio, say: Say) -> dict[str, Any]:
-    """Run for `minutes` with faults in proportion to the time; Linux only. Blocks.
+    """Measure a live run, if `torture` with faults in proportion to the time; Linux only. 0 minutes: the usual length.
 
     Raises ConfigError without PulseAudio, BusError if the run does not begin.
     """
+    if not torture:
+        return live(minutes, audio, say)
+    minutes = minutes or _MINUTES
     check_audio(audio)
     idle = idle_loop(3.0)
     order = [kind for kind in KINDS for _ in range(max(1, round(_EACH * minutes / _MINUTES)))]
@@ -122,21 +110,30 @@ def tortured(minutes: float, audio: Audio, say: Say) -> dict[str, Any]:
                 report = _ended(process, folder)
             torque = [servo.id for servo in chain.servos if chain.state(servo.id)["torque"]]
         result = _judged(blows, report, folder / "run", torque)
-    return {"minutes": minutes, "audio": audio, "idle": idle, "load": load(), **result}
+    result = {"minutes": minutes, "audio": audio, "idle": idle, "load": load(), **result}
+    missed = result["missed_ticks"]
+    lines = [
+        f"load {result['load']}, an empty loop has a jitter p99 of {result['idle']['jitter_ms']['p99']} ms",
+        f"{result['ticks']} ticks; missed within {_AFTER_S:g} s of a blow {missed['after_a_blow']}, otherwise "
+        f"{missed['otherwise']}; torque left on: {result['torque_left_on'] or 'none'}; the run ended: {result['exit']}",
+        "passed" if result["passed"] else "not passed",
+    ]
+    table = [{"what": kind, **row} for kind, row in result["counts"].items()]
+    return BenchResult(result, table, lines, result["passed"])
 
 
 @dataclass(kw_only=True)
 class _Victim:
     """The run, the devices that it uses, and its status."""
 
-    process: subprocess.Popen[bytes]
+    process: Process
     port: int
     chain: Chain
     head: Head
     person: LivePerson
     cuts: int = 0
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> Figures:
         """Return the status document. Raises BusError when the run is over."""
         try:
             return _status(self.port)
@@ -182,9 +179,9 @@ def listener_of(pid: int) -> int:
     raise BusError("bench live: the run has no listener's process")
 
 
-def _status(port: int) -> dict[str, Any]:
+def _status(port: int) -> Figures:
     with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=5) as answer:
-        document: dict[str, Any] = json.load(answer)
+        document: Figures = json.load(answer)
     return document
 
 
@@ -209,7 +206,7 @@ def _strike(victim: _Victim, order: Sequence[str], duration_s: float, say: Say) 
     return blows
 
 
-def _judged(blows: Sequence[Blow], report: Mapping[str, Any], folder: Path, torque: Sequence[int]) -> dict[str, Any]:
+def _judged(blows: Sequence[Blow], report: Figures, folder: Path, torque: Sequence[int]) -> Figures:
     recording = read_recording(folder)
     by_kind = {kind: [blow for blow in blows if blow.kind == kind] for kind in KINDS}
 
@@ -278,10 +275,11 @@ def missed_ticks(times_s: Any, blows_s: Sequence[float]) -> dict[str, float]:
 
 
 @contextmanager
-def _running(
-    folder: Path, chain: Chain, person: LivePerson, audio: Audio
-) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
-    """Start `run` and yield its process and status port once the listener listens."""
+def _running(folder: Path, chain: Chain, person: LivePerson, audio: Audio) -> Iterator[tuple[Process, int]]:
+    """Start `run` and yield its process and status port once the listener listens.
+
+    Raises BusError when the run ends before that, or it takes too long.
+    """
     port = free_port()
     words = [
         "run", "--head", str(patient_head(folder, chain.read_deadline_s)), "--port", chain.device,
@@ -289,37 +287,27 @@ def _running(
         "--face", person.face, "--record", str(folder / "run"), "--status", str(port), "--json", "--yes",
     ]  # fmt: skip
     environment = {**package_environment(), **person.environment}
-    with (
-        (folder / "out").open("wb") as out,
-        (folder / "said").open("wb") as said,
-        held([*MAIN, *words], None, stdin=subprocess.DEVNULL, stdout=out, stderr=said, env=environment) as process,
-    ):
-        _wait_listening(process, port, folder / "said")
+    with held([*MAIN, *words], None, folder, environment) as process:
+        ends_s, status = time.monotonic() + _START_S, dict[str, Any]()
+        while status.get("listener_state", {}).get("state") != "listening" or status["state"] in (
+            "starting",
+            "degraded",
+        ):
+            if time.monotonic() >= ends_s or process.poll() is not None:
+                lines = (folder / SAID).read_text(encoding="utf-8").strip().splitlines()
+                raise BusError(f"bench live: the run did not begin to listen: {lines[-1:]}")
+            time.sleep(_LOOK_S)
+            with suppress(OSError):  # the server is not up yet
+                status = _status(port)
         yield process, port
 
 
-def _wait_listening(process: subprocess.Popen[bytes], port: int, said: Path) -> None:
-    """Block until the listener listens. Raises BusError when the run ends or that takes too long."""
-    ends_s = time.monotonic() + _START_S
-    while time.monotonic() < ends_s and process.poll() is None:
-        try:
-            status = _status(port)
-        except OSError:  # the server is not up yet
-            status = {}
-        if status.get("listener_state", {}).get("state") == "listening":
-            if status["state"] not in ("starting", "degraded"):
-                return
-        time.sleep(_LOOK_S)
-    lines = said.read_text(encoding="utf-8").strip().splitlines()
-    raise BusError(f"bench live: the run did not begin to listen: {lines[-1:]}")
-
-
-def _ended(process: subprocess.Popen[bytes], folder: Path) -> dict[str, Any]:
+def _ended(process: Process, folder: Path) -> Figures:
     """Interrupt the run and return its report. Blocks until it is over."""
     process.send_signal(signal.SIGINT)
     try:
         process.wait(_END_S)
     except subprocess.TimeoutExpired as error:
         raise BusError(f"bench live: the run did not end within {_END_S:g} s of Ctrl-C") from error
-    report: dict[str, Any] = json.loads((folder / "out").read_text(encoding="utf-8").splitlines()[-1])
+    report: Figures = json.loads((folder / OUT).read_text(encoding="utf-8").splitlines()[-1])
     return report

@@ -17,7 +17,7 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 
 from sfms_robot.config import load_training
 from sfms_robot.data import data_dir
-from sfms_robot.lab.bench.measure import BenchResult, Row, Say, row
+from sfms_robot.lab.bench.measure import BenchResult, Row, Rows, Say, row
 from sfms_robot.lab.learning.job import Job, ProcessGroup
 from sfms_robot.lab.learning.train_runs import jobs_of
 from sfms_robot.lab.learning.training_loop import Gradients, make_step
@@ -29,7 +29,7 @@ MOST_BESIDE: Final = {"arig": 0.15}  # share of a step, by job
 
 def measure(say: Say, steps: int = 12) -> BenchResult:
     """Measure `steps` of every job of the shipped files, after one that is not measured. Blocks for half a minute."""
-    rows = dict[str, Row]()
+    rows = Rows()
     one_thread()
     for file in FILES:
         for job in jobs_of(load_training(data_dir("configs") / "training" / f"{file}.yaml")):

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.stats import linregress
@@ -21,7 +21,8 @@ from scipy.stats import linregress
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.drawing import PLACE_M, SIZE_PX, VirtualWebcam
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, MOTION_DIM, Doubles, Floats
-from sfms_robot.lab.bench.measure import BenchResult, Row, percentiles, times
+from sfms_robot.lab import Figures
+from sfms_robot.lab.bench.measure import BenchResult, Row, Rows, percentiles, times
 from sfms_robot.sources.webcam import Landmarker, Picture, SeenFace, open_webcam
 
 SEEN_CORRELATION: Final = 0.8  # a channel counts as seen if it follows this well, and this far
@@ -85,7 +86,7 @@ def measure() -> BenchResult:
     return BenchResult(result, table, lines)
 
 
-def webcam(names: Sequence[str] = CHANNELS) -> dict[str, Any]:
+def webcam(names: Sequence[str] = CHANNELS) -> Figures:
     """Return `channels`, `place` and `timings_ms`.
 
     A channel has correlation, slope, tremble, whether it counts as seen, and the other blendshape that moves most with
@@ -105,16 +106,23 @@ def face_of(**channels: float) -> Floats:
     return motion
 
 
-def _followed(sight: _Sight, names: Sequence[str]) -> tuple[dict[str, Row], dict[str, Row]]:
+def _followed(sight: _Sight, names: Sequence[str]) -> tuple[Rows, Rows]:
     ahead = sight.draw(face_of())
     still = np.array([sight.seen(ahead) for _ in range(_TREMBLE_PICTURES)])
     rest, tremble = still.mean(axis=0), still.std(axis=0)
     rests = {yaw: sight.draw(face_of(yaw=yaw)) for yaw in _YAWS_RAD}
-    channels: dict[str, Row] = {}
-    place: dict[str, Row] = {}
+    channels: Rows = {}
+    place: Rows = {}
     for name in names:
         if name in BLENDSHAPES:
-            asked, came = _shape(sight, name, rests)
+            asked = np.tile(_SHAPE_LEVELS, len(rests))
+            together, seen = [name, _EYES[name]] if name in _EYES else [name], []
+            for yaw, drawn in rests.items():
+                turned = sight.seen(drawn)
+                seen.append(sight.seen(drawn) - turned)
+                for level in _SHAPE_LEVELS[1:]:
+                    seen.append(sight.seen(sight.draw(face_of(yaw=yaw, **dict.fromkeys(together, level)))) - turned)
+            came = np.array(seen)
         elif name in _MOVES:
             asked = np.array(_MOVE_LEVELS_M)
             spots = np.array(PLACE_M) + np.multiply.outer(asked, _MOVES[name])
@@ -124,32 +132,21 @@ def _followed(sight: _Sight, names: Sequence[str]) -> tuple[dict[str, Row], dict
         else:
             asked = np.array(_TURN_LEVELS_RAD)
             came = np.array([sight.seen(sight.draw(face_of(**{name: level}))) - rest for level in _TURN_LEVELS_RAD])
-        channels[name] = _row(name, asked, came, tremble)
+        index, own = CHANNEL_INDEX[name], (name, _EYES.get(name))
+        fit = _fit(asked, came[:, index])
+        changes = (
+            came[:, [CHANNEL_INDEX[each] for each in BLENDSHAPES]].T @ asked / (asked @ asked) * np.abs(asked).max()
+        )
+        others = {each: float(by) for each, by in zip(BLENDSHAPES, changes, strict=True) if each not in own}
+        most = max(others, key=lambda each: abs(others[each]))
+        channels[name] = {
+            **fit,
+            "tremble": float(tremble[index]),
+            "with": most,
+            "with_change": others[most],
+            "seen": fit["correlation"] >= SEEN_CORRELATION and fit["slope"] >= SEEN_SLOPE,
+        }
     return channels, place
-
-
-def _shape(sight: _Sight, name: str, rests: Mapping[float, Picture]) -> tuple[Doubles, Doubles]:
-    """Return the levels (N,) of a blendshape, at several yaws, and what was seen beyond rest (N, 61)."""
-    together = [name, _EYES[name]] if name in _EYES else [name]
-    came = []
-    for yaw, drawn in rests.items():
-        rest = sight.seen(drawn)
-        came.append(sight.seen(drawn) - rest)
-        for level in _SHAPE_LEVELS[1:]:
-            came.append(sight.seen(sight.draw(face_of(yaw=yaw, **dict.fromkeys(together, level)))) - rest)
-    return np.tile(_SHAPE_LEVELS, len(rests)), np.array(came)
-
-
-def _row(name: str, asked: Doubles, came: Doubles, tremble: Doubles) -> Row:
-    index = CHANNEL_INDEX[name]
-    fit = _fit(asked, came[:, index])
-    shapes = came[:, [CHANNEL_INDEX[each] for each in BLENDSHAPES]]
-    changes = shapes.T @ asked / (asked @ asked) * np.abs(asked).max()
-    own = (name, _EYES.get(name))
-    others = {each: float(by) for each, by in zip(BLENDSHAPES, changes, strict=True) if each not in own}
-    most = max(others, key=lambda each: abs(others[each]))
-    seen = fit["correlation"] >= SEEN_CORRELATION and fit["slope"] >= SEEN_SLOPE
-    return {**fit, "tremble": float(tremble[index]), "with": most, "with_change": others[most], "seen": seen}
 
 
 def _fit(asked: Doubles, came: Doubles) -> Row:
@@ -163,13 +160,13 @@ def _fit(asked: Doubles, came: Doubles) -> Row:
 # --- time -----------------------------------------------------------------------------------------------------------
 
 
-def _timings() -> dict[str, Any]:
+def _timings() -> Figures:
     """Measure a picture with one and with three faces looked for, and from picture to sighting in a child process."""
     camera = VirtualWebcam()  # a person who nods once a second
     once = [camera.picture(face_of(pitch=0.1 * float(np.sin(2 * np.pi * k / _PICTURE_HZ)))) for k in range(_PICTURE_HZ)]
     pictures = [once[k % _PICTURE_HZ] for k in range(round(_VIDEO_S * _PICTURE_HZ))]
     numbers = iter(range(1_000_000))
-    out: dict[str, Any] = {}
+    out: Figures = {}
     for most_faces in (1, 3):
         with closing(Landmarker(most_faces)) as landmarker:
 
@@ -192,7 +189,7 @@ def write_video(file: Path, pictures: Sequence[Picture], hz: int = _PICTURE_HZ) 
     writer.release()
 
 
-def _latency(pictures: Sequence[Picture]) -> dict[str, Any]:
+def _latency(pictures: Sequence[Picture]) -> Figures:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "nods.avi"
         write_video(file, pictures)
@@ -202,5 +199,5 @@ def _latency(pictures: Sequence[Picture]) -> dict[str, Any]:
             while webcam.statistics()["state"] != "finished":
                 webcam.at(time.monotonic() - origin_s)
                 time.sleep(0.01)
-            found: dict[str, Any] = webcam.statistics()["latency_ms"]
+            found: Figures = webcam.statistics()["latency_ms"]
             return found

@@ -1,11 +1,12 @@
 """What `bench throttle` holds against a run: states that are not those of the table, and a tree that is held."""
 
+import os
 import subprocess
 import sys
 
 import pytest
 
-from sfms_robot.lab.bench.throttle_bench import held, processes_of, state_problems
+from sfms_robot.lab.bench.throttle_bench import OUT, held, processes_of, state_problems
 
 WELL = [(0.0, "starting", ()), (1.0, "listening", ()), (10.0, "stopping", ()), (11.0, "stopped", ())]
 PLANS = [(0.2 * count, 0.2 * count + 0.3) for count in range(1, 50)]
@@ -55,7 +56,6 @@ def test_a_process_and_all_that_it_starts_are_found():
 
 
 @linux
-def test_what_is_held_to_a_share_of_a_core_comes_to_its_end_all_the_same():
-    with held(["-c", "print(sum(range(10_000)))"], 0.5, stdout=subprocess.PIPE) as process:
-        assert process.stdout.read() == b"49995000\n" and process.wait() == 0
-        process.stdout.close()
+def test_what_is_held_to_a_share_of_a_core_comes_to_its_end_all_the_same(tmp_path):
+    with held(["-c", "print(sum(range(10_000)))"], 0.5, tmp_path, os.environ) as process:
+        assert process.wait() == 0 and (tmp_path / OUT).read_bytes() == b"49995000\n"
