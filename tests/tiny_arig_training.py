@@ -7,8 +7,7 @@ import numpy as np
 from sfms_robot import config
 from sfms_robot.config import parse_training
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES, ListenerEvent
-from sfms_robot.lab.corpora import clips
-from sfms_robot.lab.corpora.conversational_states import states_of_activity
+from sfms_robot.lab.corpora import clips, conversational_states
 
 HZ = 25
 TINY = {
@@ -51,7 +50,7 @@ def dyad(name: str, scene: str, seed: int) -> clips.Dyad:
         listener=motion,
         listening=user & ~agent,
         agent_audio=voice(agent),
-        states=states_of_activity(agent, user),
+        states=conversational_states.states_of_activity(agent, user),
         events=tuple(ListenerEvent("nod", start_s, 0.6, 0.05, 2) for start_s in (2.0, 5.0, 9.0)),
         head_of_gaze_rad=np.zeros((frames, 3), np.float32),
     )

@@ -188,7 +188,9 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
             if (values := getattr(dyad, key)) is not None:
                 arrays[key] = values.astype(filed)
         if dyad.events is not None:
-            arrays["events"] = _event_rows(dyad.events)
+            none = (np.nan, np.nan)
+            rows = [(e.start_s, e.duration_s, e.size, e.kind, e.swings, e.target_rad or none) for e in dyad.events]
+            arrays["events"] = np.array(rows, _EVENT)  # the draws behind them are left out
         if (dyad.space, dyad.fps) != ("arkit58", FRAME_HZ):
             arrays |= {"space": np.array(dyad.space), "fps": np.array(dyad.fps)}
         arrays |= {FEATURE + name: rows for name, rows in dyad.features.items()}
@@ -205,6 +207,14 @@ def read(file: Path) -> Dyad:
             voices = {key: arrays[key].astype(np.float32) / 32767 for key in _VOICES if key in arrays}
             if "space" in arrays:
                 optional |= {"space": str(arrays["space"]), "fps": float(arrays["fps"])}
+            if "events" in arrays:
+                optional["events"] = tuple(
+                    ListenerEvent(
+                        kind, start_s, duration_s, size, swings,
+                        None if np.isnan(target).any() else tuple(target.tolist()),
+                    )
+                    for start_s, duration_s, size, kind, swings, target in arrays["events"].astype(_EVENT).tolist()
+                )  # fmt: skip
             return Dyad(
                 name=file.stem,
                 audio=voices.get("audio"),
@@ -213,7 +223,6 @@ def read(file: Path) -> Dyad:
                 listening=arrays["listening"].astype(bool),
                 features={key.removeprefix(FEATURE): arrays[key] for key in arrays if key.startswith(FEATURE)},
                 agent_audio=voices.get("agent_audio"),
-                events=_events(arrays["events"]) if "events" in arrays else None,
                 **optional,
             )
     except UNREADABLE as error:
@@ -239,22 +248,6 @@ def read_takes(file: Path) -> dict[str, list[Take]]:
     except (OSError, ValueError, KeyError) as error:
         raise ConfigError(f"{file}: not a file of recorded takes: {error}") from error
     return found
-
-
-def _event_rows(events: Sequence[ListenerEvent]) -> NDArray[np.void]:
-    """Return kind and size of each event, one row each; the draws behind it are left out."""
-    none = (np.nan, np.nan)
-    rows = [(e.start_s, e.duration_s, e.size, e.kind, e.swings, e.target_rad or none) for e in events]
-    return np.array(rows, _EVENT)
-
-
-def _events(rows: NDArray[np.void]) -> tuple[ListenerEvent, ...]:
-    return tuple(
-        ListenerEvent(
-            kind, start_s, duration_s, size, swings, None if np.isnan(target).any() else tuple(target.tolist())
-        )
-        for start_s, duration_s, size, kind, swings, target in rows.astype(_EVENT).tolist()
-    )
 
 
 # --- Splits: one table for composing, fitting and scoring -----------------------------------------------------------

@@ -410,7 +410,7 @@ def dyad_of(
     said = sound(voices[1], frames, fps) if voices and voices[1].is_file() else None
     listening = np.ones(frames, bool)
     if audio is not None and said is not None:
-        listening = listening_mask(speaks(audio, frames, fps), fps, speaks(said, frames, fps))
+        listening = listening_mask(speaks(audio, frames, fps), speaks(said, frames, fps), fps)
     return Dyad(
         name=name, audio=audio, speaker=speaker, listener=listener, listening=listening, space=space, fps=fps, mel=mel,
         agent_audio=said if own else None,
@@ -419,7 +419,7 @@ def dyad_of(
 
 def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
     """Return (frames,) True in frames with speech; False after the end of the sound."""
-    active = voice_activity(voice, AUDIO_HZ, 1 / fps)[:frames]
+    active = voice_activity(voice, 1 / fps)[:frames]
     return np.pad(active, (0, frames - len(active)))
 
 

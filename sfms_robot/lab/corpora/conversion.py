@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE, SHAPES, Doubles, Floats
+from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE, SHAPES, Floats
 from sfms_robot.lab.corpora.clips import FAU_VALUE, FULL, WITHOUT_SHAPE, Dyad, at_rate, blendshapes_of, samples_of
 from sfms_robot.listeners.space import SPACES, FlameMatrix, MotionSpace, rest_of
 from sfms_robot.signals.mel import ROWS_PER_FRAME
@@ -125,8 +125,12 @@ def in_ours(motion: Floats, space: str, flame: FlameMatrix | None = None) -> Flo
 def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | None) -> None:
     if dyad.space == "arkit58":
         return
-    filed = dyad.listener.astype(np.float64)
-    residual.pose_rad = max(residual.pose_rad, float(_apart_rad(filed, ours, dyad.space).max(initial=0.0)))
+    filed, seamless = dyad.listener.astype(np.float64), dyad.space == "seamless27"
+    name, turned = ("deca56", _ANGLES) if seamless else (dyad.space, SPACES[dyad.space].rotation)
+    known = SPACES[name]  # heads as filed, and ours expressed in the source's terms again
+    back = MotionSpace(name, rest_of(name)).encode(ours)[:, known.rotation].astype(np.float64)
+    apart_rad = angle_between(known.matrices(filed[:, turned]), known.matrices(back))
+    residual.pose_rad = max(residual.pose_rad, float(apart_rad.max(initial=0.0)))
     if dyad.space == "deca56":
         shown = ours[:, SHAPES].astype(np.float64) @ flame.rows if flame is not None else 0.0
         expression = filed[:, SPACES["deca56"].expression]
@@ -135,7 +139,6 @@ def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | Non
             filter(None, [MotionSpace("deca56", rest_of("deca56"), flame=flame).limitation])
         )
     else:
-        seamless = dyad.space == "seamless27"
         columns, low, high = (_UNITS, -np.inf, FULL) if seamless else (SPACES[dyad.space].expression, 0.0, 1.0)
         expression = filed[:, columns]
         lost = expression - np.clip(expression, low, high)
@@ -145,14 +148,6 @@ def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | Non
             lost[:, _UNSHOWN] = expression[:, _UNSHOWN]
     residual.expression2 += float(np.square(expression).sum())
     residual.left2 += float(np.square(lost).sum())
-
-
-def _apart_rad(filed: Doubles, ours: Floats, space: str) -> Doubles:
-    """Return angles (N,) between heads as filed, and ours expressed in the source's terms again."""
-    name, columns = ("deca56", _ANGLES) if space == "seamless27" else (space, SPACES[space].rotation)
-    known = SPACES[name]
-    back = MotionSpace(name, rest_of(name)).encode(ours)[:, known.rotation].astype(np.float64)
-    return angle_between(known.matrices(filed[:, columns]), known.matrices(back))
 
 
 # --- Dyads of other frame rates at 25 fps: what a listener that is streamed through them asks for -----------------

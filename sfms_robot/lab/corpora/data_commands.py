@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -18,14 +17,13 @@ import yaml
 from sfms_robot.app.progress import bar, tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import SPACE_CHANNELS, Doubles
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora import clips, formats
 from sfms_robot.lab.corpora.clips import SEAMLESS_CHANNELS, Dyad
 from sfms_robot.lab.corpora.collection import Clip, ClipError, Dataset, Layout, Order, Problem, guarded
 from sfms_robot.lab.corpora.compose.composed import compose_folder
 from sfms_robot.lab.corpora.conversion import CONVERTIBLE, FIGURES, Residual, to_ours
 from sfms_robot.listeners.space import FlameMatrix, read_matrix
-
-Figures = dict[str, Any]  # for JSON
 
 
 def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: bool, jobs: int) -> Figures:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from sfms_robot.config import find, load_training
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import POSE, SHAPES, Doubles
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.collection import Order
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation import metrics
@@ -47,6 +48,7 @@ CLIP_FRAMES: Final = 250
 PARTS: Final = {"exp": SHAPES, "pose": POSE}
 _CLUSTERS: Final = {"exp": 40, "pose": 20}  # DIM's; the paper names none
 _NAMES: Final = tuple(f"{column} {part}" for column in ("FD", "RPCC", "SID", "Var") for part in PARTS)
+_OF_A_FOLDER: Final = str.maketrans(" ", "-", "/,")  # a row's label as a name
 _LEAST_ALIKE: Final = 0.5  # variance of faces that can be compared, over people's; at most its inverse
 
 
@@ -94,7 +96,7 @@ def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str
         moves = seen.any() and all(np.ptp(each[seen]) > 0 for each in (real, ours, other))
         found.append((
             metrics.frechet_distance(real, ours),
-            metrics.rpcc_flat(real[seen], ours[seen], other[seen]) if moves else float("nan"),
+            metrics.rpcc_flat(real[seen], ours[seen], other[seen]) if moves else np.nan,
             metrics.shannon_index(ours, centres[part], "bits"),
             metrics.variance(ours),
         ))  # fmt: skip
@@ -103,14 +105,14 @@ def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str
 
 def rows_of(
     table: str, truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles], people: Sequence[str] = ()
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+) -> tuple[list[Figures], list[Figures]]:
     """Return the rows of a table (truth, ours by name, the paper's), and what holds of the paper's statements.
 
     Rows of `arig-1` and `arig-4` have the paper's RPCC, SID and Var beside ours. Answers hold the clips of one training
     after another. `people`: the listener of each clip of the truth, for intervals over them and over trainings.
     """
 
-    def row(name: str, source: str, values: Mapping[str, float | None]) -> dict[str, Any]:
+    def row(name: str, source: str, values: Mapping[str, float | None]) -> Figures:
         figures = {key: rounded(value, 5) for key, value in values.items()}
         return {"name": name, "source": source, "trainings": None, **figures}
 
@@ -135,8 +137,8 @@ def rows_of(
 
 
 def claims(
-    table: str, rows: Mapping[str, Mapping[str, Any]], draws: Mapping[str, Mapping[str, Doubles]], truth: Doubles
-) -> list[dict[str, Any]]:
+    table: str, rows: Mapping[str, Figures], draws: Mapping[str, Mapping[str, Doubles]], truth: Doubles
+) -> list[Figures]:
     """Return what holds of: with all parts more kinds of motion, an RPCC and a variance nearer to people's.
 
     Differences are of the same people, over people and trainings (`intervals.verdict`). Fewer than three trainings
@@ -154,28 +156,25 @@ def claims(
         enough = min(rows[each]["trainings"] for each in ("ARIG", name)) >= LEAST_SEEDS
         for part in PARTS:
             for metric in ("SID", "RPCC", "Var"):
-                whole, less = (_merit(metric, draws[each], draws["GT"], part) for each in ("ARIG", name))
-                interval = intervals({"": whole - less}).get("") if enough else None
+                figure = f"{metric} {part}"
+                whole, less = (draws[each][figure] for each in ("ARIG", name))
+                if metric == "Var":
+                    whole, less = (np.abs(each - draws["GT"][figure]) for each in (whole, less))
+                better = whole - less if metric == "SID" else less - whole
+                interval = intervals({"": better}).get("") if enough else None
                 comparable = metric != "SID" or (alike("ARIG", part) and alike(name, part))
                 found.append({
-                    "name": name, "figure": f"{metric} {part}",
-                    "with all parts better by": round(float(np.mean(whole - less)), 5),
+                    "name": name, "figure": figure, "with all parts better by": round(float(np.mean(better)), 5),
                     "interval": interval,
                     "verdict": verdict(interval, comparable=comparable),
                 })  # fmt: skip
     return found
 
 
-def _merit(metric: str, row: Mapping[str, Doubles], people: Mapping[str, Doubles], part: str) -> Doubles:
-    """Return a figure of each draw as a number of which more is better."""
-    values = row[f"{metric} {part}"]
-    return values if metric == "SID" else -values if metric == "RPCC" else -np.abs(values - people[f"Var {part}"])
-
-
 # --- listeners that are played --------------------------------------------------------------------------------------
 
 
-def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bool = True) -> dict[str, Any]:
+def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bool = True) -> Figures:
     """Return `arig-2`: `names` side by side on the listening set; or `arig-1`, `arig-4`: ablations, on interaction.
 
     Args:
@@ -204,7 +203,7 @@ def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bo
             label: [
                 trained("arig", TrainOptions(
                     file=options.training or training_file("arig"), data=data, steps=options.steps,
-                    out=models / (_folder(label) if differing else unchanged),
+                    out=models / (label.translate(_OF_A_FOLDER).lower() if differing else unchanged),
                     seed=None if trial == 1 else trial, **differing,
                 ))
                 for trial in range(1, options.seeds + 1)
@@ -230,10 +229,6 @@ def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bo
     scored, said = rows_of(name, truth, speaker, answers, people)
     found = {"table": name, "split": split, "clips": len(truth), "frames": CLIP_FRAMES, "rows": scored}
     return found if name == "arig-2" else {**found, "claims": said}
-
-
-def _folder(label: str) -> str:
-    return label.replace("/", "").replace(",", "").replace(" ", "-").lower()
 
 
 def training_file(kind: Kind) -> Path:
@@ -268,9 +263,7 @@ _SFMS_TABLES: Final = ("1", "2")
 EVERY: Final = (*_SFMS_TABLES, *TOKENIZER_TABLES, *ARIG_TABLES)
 
 
-def evaluate_papers(
-    options: TableOptions, tables: Sequence[str], each: Callable[[str, dict[str, Any]], None]
-) -> dict[str, Any]:
+def evaluate_papers(options: TableOptions, tables: Sequence[str], each: Callable[[str, Figures], None]) -> Figures:
     """Return the `tables` (of `EVERY`); call `each(name, table)` as soon as one is done.
 
     Without a folder of models their rows are left out, and `not_trained` of a table lists how to make them. Blocks for
@@ -279,7 +272,7 @@ def evaluate_papers(
     unknown = [name for name in tables if name not in EVERY]
     if unknown:
         raise ConfigError(f"--table {unknown[0]}: is not one of {', '.join(EVERY)}")
-    found: dict[str, dict[str, Any]] = {}
+    found: dict[str, Figures] = {}
     models = options.models
     for name in tables:
         if name in TOKENIZER_TABLES:
@@ -295,7 +288,7 @@ def evaluate_papers(
     return {"tables": found}
 
 
-def sfms_table(number: int, names: Sequence[str], options: TableOptions) -> dict[str, Any]:
+def sfms_table(number: int, names: Sequence[str], options: TableOptions) -> Figures:
     """Return table 1 or 2 of SFMS for listeners by name; with a folder of models also for the paper as written."""
     data, order, samples = options.data, options.order, options.samples
     listeners = {name: load_at_hop(name, options.hop, "auto") for name in names}

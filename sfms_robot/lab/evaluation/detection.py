@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from scipy.signal import welch
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, YAW_PITCH, Bools, Doubles, Floats, ListenerEvent
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.evaluation import phrase_timing
@@ -79,7 +80,7 @@ class Sightings:
         found = [known[place] for place in there if place in known]
         return float(np.mean(found)) if found else np.nan
 
-    def report(self, kind: str) -> dict[str, Any]:
+    def report(self, kind: str) -> Figures:
         """Return counts, recall, precision and lateness, and the recall by size; None where undefined."""
         edges = _SIZES[kind]
         place = np.digitize(self.sizes, edges)
@@ -215,10 +216,10 @@ class DetectorCalibration:
         nods = self.known.get("nod", Sightings())
         return nods.precision / nods.recall if nods.in_time.any() else 1.0
 
-    def report(self) -> dict[str, Any]:
+    def report(self) -> Figures:
         return {kind: one.report(kind) for kind, one in self.known.items() if len(one.sizes)}
 
-    def report_of(self, sightings: Mapping[str, Sightings]) -> dict[str, Any]:
+    def report_of(self, sightings: Mapping[str, Sightings]) -> Figures:
         """Return reports of sightings, with the recall of known events of the same sizes as "recorded"."""
         return {
             kind: {
@@ -278,13 +279,11 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
     for motion, dyad in zip(motions, dyads, strict=True):
         nods = events.find_nods(motion[:, CHANNEL_INDEX["pitch"]], FRAME_HZ)
         starts = [start for start, _, _ in nods]
-        listened += float(dyad.listening.sum()) / FRAME_HZ / 60
+        listened += phrase_timing.minutes_of(dyad.listening)
         onsets += sum(bool(dyad.listening[int(start * FRAME_HZ)]) for start in starts)
         sizes += [size for _, _, size in nods]
         spoke = np.zeros(len(motion), bool) if dyad.audio is None else phrase_timing.voice_activity(dyad.audio)
-        counts += phrase_timing.phrase_end_counts(
-            starts, phrase_timing.phrase_ends(spoke, FRAME_HZ), dyad.listening, FRAME_HZ
-        )
+        counts += phrase_timing.phrase_end_counts(starts, phrase_timing.phrase_ends(spoke), dyad.listening)
     minutes = sum(map(len, motions)) / FRAME_HZ / 60
     still = []
     for motion in motions:
@@ -389,7 +388,7 @@ def looks_s(gaze: Doubles) -> list[float]:
 
 def shifts(gaze: Doubles) -> int:
     """Return how often gaze (N, 2) moves by 5 degrees or more within 0.2 s."""
-    return len(find_gaze_shifts(gaze, FRAME_HZ, _SHIFT_RAD))
+    return len(find_gaze_shifts(gaze, _SHIFT_RAD))
 
 
 def sway_db(motions: Sequence[Floats]) -> Doubles:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from sfms_robot.app.progress import tracked
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Bools, Doubles, Floats
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
 from sfms_robot.lab.evaluation.listener_tables import spread_clips
@@ -30,7 +31,7 @@ _STILL: Final = 1e-4  # deviation of a jaw that does not move
 States = NDArray[np.int8]
 
 
-def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, split: str = "test") -> dict[str, Any]:
+def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, split: str = "test") -> Figures:
     """Return figures of states, lips, chunk borders and the end of speech on the sets of `data` of a split.
 
     At most `clips` dyads of each set. Raises ConfigError for a listener without states, or data without such sets.
@@ -44,7 +45,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, sp
     every = [one for scene in held_out for one in rolled[scene]]
     dyads = [dyad for each in held_out.values() for dyad in each]
     motions, people = [one.motion[0] for one in every], [dyad.listener for dyad in dyads]
-    lips: dict[str, Any] = {}
+    lips: Figures = {}
     for scene in ("speaking", "interaction"):  # filmed recordings, and the agent's talk in interaction
         if scene in held_out:
             made, recorded = [one.motion[0] for one in rolled[scene]], [dyad.listener for dyad in held_out[scene]]
@@ -65,7 +66,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, sp
 # --- states ---------------------------------------------------------------------------------------------------------
 
 
-def _states(rolled: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips: int | None) -> dict[str, Any]:
+def _states(rolled: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips: int | None) -> Figures:
     """Return accuracies of the listener's states, and of two rules on voices that the training labels give."""
     labelled = [
         (one.states[0], dyad, dyad.states) for one, dyad in zip(rolled, dyads, strict=True) if dyad.states is not None
@@ -79,7 +80,7 @@ def _states(rolled: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips:
     tables = {
         name: confusion(answers, truth) for name, answers in {"state": said, **_by_rule(voices, data, clips)}.items()
     }
-    found: dict[str, Any] = {}
+    found: Figures = {}
     for name, table in tables.items():
         found[f"{name}_accuracy"], found[f"{name}_balanced_accuracy"] = accuracies(table)
     return {**found, "confusion": {"states": list(STATES), "label_by_answer": tables["state"].tolist()}}
@@ -131,7 +132,7 @@ def accuracies(table: NDArray[np.int64]) -> tuple[float, float]:
     """
     of, found = table.sum(axis=1), np.diag(table)
     if not of.any():
-        return float("nan"), float("nan")
+        return np.nan, np.nan
     return float(found.sum() / of.sum()), float((found[of > 0] / of[of > 0]).mean())
 
 
@@ -178,7 +179,7 @@ def border_ratio(motions: Sequence[Floats], period: int) -> float:
         at.append(size[across])
         away.append(size[~across])
     inside = float(np.concatenate(away).mean()) if away else 0.0
-    return float(np.concatenate(at).mean()) / inside if inside else float("nan")
+    return float(np.concatenate(at).mean()) / inside if inside else np.nan
 
 
 def listening_again(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> float:
@@ -189,8 +190,8 @@ def listening_again(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> float:
             continue
         active = audio_frontend.track(dyad.agent_audio)[1]
         spans = np.flatnonzero(active)[:, None] * FRAME_S + np.array([0.0, FRAME_S])
-        recent = near(spans, len(active), 1 / FRAME_S, 1.0)
+        recent = near(spans, len(active), 1.0)
         speaking.append(one[active, _JAW])
         after.append(one[~recent, _JAW])
     said, quiet = np.concatenate(speaking), np.concatenate(after)
-    return float(quiet.mean() / said.mean()) if len(said) and len(quiet) and said.mean() > 0 else float("nan")
+    return float(quiet.mean() / said.mean()) if len(said) and len(quiet) and said.mean() > 0 else np.nan

@@ -40,7 +40,7 @@ class Estimate:
 
 def ends(values: Doubles) -> Doubles:
     """Return the ends (2, ...) of the interval of `LEVEL` of draws (R, ...)."""
-    return np.asarray(np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0))
+    return np.quantile(values, [(1 - LEVEL) / 2, (1 + LEVEL) / 2], axis=0)
 
 
 def rounded(value: float | None, digits: int = 4) -> float | None:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, Ints, ListenerEvent, SpeakerFrame, changed
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
@@ -62,13 +61,13 @@ class ListenerMeeting:
     @property
     def listening(self) -> Bools:
         """Return (N,): others spoke in the last 2 s, the listener is silent and in view."""
-        return phrase_timing.listening_mask(self.others, FRAME_HZ, self.own) & ~self.unseen
+        return phrase_timing.listening_mask(self.others, self.own) & ~self.unseen
 
     @property
     def spoken_to(self) -> Bools:
         """Return (N,): exactly one other speaks, with known attention, and the listener was silent for a second."""
         ends_s = [end / FRAME_HZ for _, end in events.runs(self.own)]
-        spoke = phrase_timing.window_after(ends_s, (0.0, _SILENT_S), self.frames, FRAME_HZ)
+        spoke = phrase_timing.window_after(ends_s, (0.0, _SILENT_S), self.frames)
         return self.listening & self.alone & ~spoke & ~np.isnan(self.attention)
 
     @property
@@ -127,7 +126,7 @@ class ListenerMeeting:
 def frames_before(starts_s: Doubles, frames: int) -> Ints:
     """Return the last frame (K,), of `frames`, that is over at each instant (K,)."""
     before = np.floor(starts_s * FRAME_HZ + 1e-6).astype(np.int64) - 1
-    return np.asarray(before.clip(0, frames - 1))
+    return before.clip(0, frames - 1)
 
 
 def listener_meeting(
@@ -145,7 +144,13 @@ def listener_meeting(
         said = sent(lay(_spoken(person.talk, whole), whole.frames, own, rng)[0], rng)
     talks = {agent: active(spans_by(person.floor, agent), whole) for agent in {agent for _, _, agent in person.floor}}
     alone = np.sum([np.zeros(whole.frames, np.int64), *talks.values()], axis=0) == 1
-    floor = _floor(person, talks, alone)
+    floor = np.full(whole.frames, "", dtype="<U1")  # the only other who speaks, else the last who spoke for a second
+    for taken_s, agent in sorted(
+        (start + _FLOOR_S, agent) for start, end, agent in person.floor if end - start >= _FLOOR_S
+    ):
+        floor[int(np.ceil(taken_s * FRAME_HZ)) :] = agent
+    for agent, talk in talks.items():
+        floor[alone & talk] = agent
     attention = np.full(whole.frames, np.nan)
     for agent in person.gaze_known:
         theirs = floor == agent
@@ -175,18 +180,7 @@ def listener_meeting(
 
 def _spoken(spans: Doubles, stretch: Stretch) -> Doubles:
     spoken = np.clip(spans, 0, stretch.end_s)
-    return np.asarray(spoken[spoken[:, 1] > spoken[:, 0]])
-
-
-def _floor(person: MeetingPerson, talks: Mapping[str, Bools], alone: Bools) -> NDArray[np.str_]:
-    """Return (N,) the only other who speaks, else the last of them who spoke for a second; "" before the first."""
-    floor = np.full(len(alone), "", dtype="<U1")
-    taken = sorted((start + _FLOOR_S, agent) for start, end, agent in person.floor if end - start >= _FLOOR_S)
-    for taken_s, agent in taken:
-        floor[int(np.ceil(taken_s * FRAME_HZ)) :] = agent
-    for agent, talk in talks.items():
-        floor[alone & talk] = agent
-    return floor
+    return spoken[spoken[:, 1] > spoken[:, 0]]
 
 
 # --- parts and variants ---------------------------------------------------------------------------------------------

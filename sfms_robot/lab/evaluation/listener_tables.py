@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -25,9 +25,9 @@ from sfms_robot.config.base import read
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, SPACE_CHANNELS, Doubles
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Dataset, Order, usable
-from sfms_robot.lab.corpora.conversion import at_frame_rate
 from sfms_robot.lab.corpora.external.l2l import l2l_mean_std
 from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.evaluation import metrics
@@ -40,6 +40,7 @@ from sfms_robot.lab.evaluation.rollout import (
     offline_rollout,
     rollout,
     rollouts,
+    streamable,
 )
 from sfms_robot.lab.learning.corpus import in_space
 from sfms_robot.lab.learning.sfms.features import frames_of, gather
@@ -56,7 +57,7 @@ FRAMES: Final = {1: 64, 2: 750}  # of a clip: Learning2Listen's and REACT's
 _LEAST_SPREAD: Final = 1e-6  # smaller spreads would divide by nearly nothing
 
 PRINTED: Final = read(data_dir("configs") / "papers.yaml")
-Score = Callable[[Chosen], dict[str, Any]]  # figures of some of the clips
+Score = Callable[[Chosen], Figures]  # figures of some of the clips
 
 
 def paper_rows(table: str) -> dict[str, dict[str, float | None]]:
@@ -81,7 +82,7 @@ class Clips:
     people: Sequence[str] = ()
 
 
-def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: int, seed: int = 0) -> dict[str, Any]:
+def table(number: int, clips: Clips, answers: Mapping[str, Doubles], samples: int, seed: int = 0) -> Figures:
     """Return table 1 or 2: rows of truth, heuristics, `answers` (N, K, T, D) by name, and the paper's.
 
     A row has `source` "here" or "paper"; `features` names the feature space of the numbers from here.
@@ -152,8 +153,8 @@ def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
     truth, speaker = scaled(clips.truth), scaled(clips.speaker)
     centres = metrics.centres_of(truth, metrics.PARTS[clips.space], metrics.CLUSTERS)
 
-    def score(pred: Doubles, chosen: Chosen) -> dict[str, Any]:
-        row: dict[str, Any] = {}
+    def score(pred: Doubles, chosen: Chosen) -> Figures:
+        row: Figures = {}
         for part, where in metrics.PARTS[clips.space].items():
             own, person = truth[chosen][..., where], speaker[chosen][..., where]
             samples = [
@@ -163,7 +164,7 @@ def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
                     "Var": metrics.variance(guess),
                     "SI": metrics.shannon_index(guess, centres[part]),
                     "P-FD": metrics.paired_frechet_distance(own, guess, person),
-                    "RPCC": metrics.rpcc_flat(own, guess, person) if np.ptp(guess) else float("nan"),
+                    "RPCC": metrics.rpcc_flat(own, guess, person) if np.ptp(guess) else np.nan,
                 }
                 for guess in (scaled(pred[chosen, k])[..., where] for k in range(pred.shape[1]))
             ]
@@ -201,7 +202,7 @@ def _table_2(clips: Clips, pred: Doubles) -> Score:
     )
     lags = metrics.synchrony_lags(pred, clips.speaker, as_challenge=False)
 
-    def score(chosen: Chosen) -> dict[str, Any]:
+    def score(chosen: Chosen) -> Figures:
         correlation, distance, diverse, varied = by_clip[chosen].mean(axis=0).tolist()
         return {
             "FRCorr": correlation * pred.shape[1],
@@ -221,7 +222,7 @@ def _table_2(clips: Clips, pred: Doubles) -> Score:
 _PLACEMENTS: tuple[Strategy, ...] = ("exact", "penalised", "static", "static_paper", "learned")
 
 
-def evaluate_tokenizer(name: str, data: Path, order: Order | None = None, split: str = "test") -> dict[str, Any]:
+def evaluate_tokenizer(name: str, data: Path, order: Order | None = None, split: str = "test") -> Figures:
     """Return the held-out reconstruction error of a listener's tokenizer, by keyframe placement."""
     folder = find("listeners", name, "config.yaml")
     settings, listener = config.load(config.Sfms, folder / CONFIG), load_folder(folder, "torch")
@@ -250,15 +251,15 @@ def evaluate_listener(
     order: Order | None = None,
     hop: int | None = None,
     split: str = "test",
-) -> dict[str, Any]:
+) -> Figures:
     """Stream the held-out speakers of `data` through listeners; return their behaviour beside that of the dyads.
 
     For an SFMS listener the rows also have its keyframe scores. `hop`: see `load_at_hop`.
     """
-    dyads = [at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, split, order))]
+    dyads = [*streamable(data, split, order)]
     if not dyads:
         raise ConfigError(f"{data}: no dyad of {split} can be read")
-    rows: list[dict[str, Any]] = []
+    rows: list[Figures] = []
     for name in names:
         listener = load_at_hop(name, hop)
         motions = [one.motion[0] for one in rollouts(listener, tracked(dyads, name), seed)]

@@ -7,17 +7,18 @@ so the figures do not depend on the number of processes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 import numpy as np
 
 from sfms_robot.config import Calmness
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles, Floats, SpeakerFrame, changed
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Split
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, find_laughter, find_voices, split_voices
@@ -26,7 +27,6 @@ from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, S
 from sfms_robot.lab.evaluation.intervals import LEVEL, Estimate, Sums, estimates, rounded
 from sfms_robot.lab.evaluation.listener_meetings import (
     SHIFT_S,
-    ListenerMeeting,
     listener_meeting,
     part,
     shifted,
@@ -104,7 +104,7 @@ class _Played:
     sightings: Mapping[str, Sightings]
 
 
-def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
+def evaluate_timing(options: TimingOptions) -> Figures:
     """Return figures with their intervals over people; None where the meetings or the listener have too little data.
 
     Raises ConfigError or ModelError.
@@ -119,6 +119,15 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
     played = run_in_processes(partial(_play, options, baselines, calibration), tasks, options.jobs, "people listening")
     sums = timing.per_person((one.participant, one.sums) for one in played)
     found = estimates(timing.figures_of(sums[0]), sums, options.seed)
+    lacking = {
+        "nod_hazard_auc": "this listener has no hazards to evaluate: there is no nod_hazard_auc",
+        "nods_per_minute": "no motion was played",
+        "r2_nod_hazard_auc": "the tables have no training people to fit the reference on",
+    }
+    notes = ["people's smiles and blinks were not annotated; laughs are compared with laughs only"]
+    if options.own_voice:
+        notes.append("it spoke when the person did, so the contingency of its own nods on the others is unknown")
+    notes += [told for name, told in lacking.items() if name not in found]
     return {
         "listener": options.listener,
         "split": options.split,
@@ -137,7 +146,7 @@ def evaluate_timing(options: TimingOptions) -> dict[str, Any]:
         "interval_level": LEVEL,
         "detector": calibration.report(),
         "asked_and_seen": calibration.report_of(added_up(one.sightings for one in played)),
-        "notes": list(_notes(found, options.own_voice)),
+        "notes": notes,
         "rows": _rows(options.listener, found),
     }
 
@@ -196,7 +205,20 @@ def _play(
     if isinstance(listener, EventfulListener):
         model, calmness = listener.when, listener.calmness
     if isinstance(model, EventModel):
-        sums |= _by_events(model, calmness, person, one, seeds, options.own_voice)
+        # Given the person's history the hazards rank the person's events. They are also computed from the annotations,
+        # without the losses of sensing; and from those with all others as one person, as for a single microphone.
+        hazards = partial(hazards_in, model, own=one.history, calmness=calmness)
+        with_voice, heard = sensed(one.speaker, calmness)
+        speaking, silent = delayed(hazards(with_voice)), hazards(heard)
+        other = hazards(sensed(shifted(one.speaker), calmness)[1])
+        sums |= timing.hazard_sums("", one, speaking["nod"], silent["nod"], other["nod"])
+        scene, _ = meeting_scene(person)
+        for who, seen in (("annotated_", scene), ("one_voice_", one_voice(scene))):
+            sums |= timing.hazard_sums(who, one, *(hazards(each)["nod"] for each in annotated(seen, one.frames)))
+        for kind in timing.ANNOTATED:
+            sums[f"{kind}_hazard_auc"] = timing.ranked(speaking[kind], one, kind)
+        streams = decisions(model, with_voice if options.own_voice else heard, seeds, calmness)
+        sums |= timing.decided_sums(one, streams, options.own_voice)
     sums |= timing.differences(sums)
     sightings: Mapping[str, Sightings] = {}
     if frames and not isinstance(listener, EventModel):
@@ -206,8 +228,8 @@ def _play(
         rolled = rollout(listener, speaker, seeds)
         detected = [Detected.of(motion) for motion in rolled.motion]
         sums |= timing.motion_sums(one, rolled.motion, detected, first, calibration, options.own_voice)
-        streams = zip(rolled.events, detected, strict=True)
-        sightings = added_up(asked_and_seen(events, each, calibration.lag_s) for events, each in streams)
+        both = zip(rolled.events, detected, strict=True)
+        sightings = added_up(asked_and_seen(events, each, calibration.lag_s) for events, each in both)
     return _Played(one.participant, one.frames / FRAME_HZ / 60, sums, sightings)
 
 
@@ -215,36 +237,6 @@ def middle(frames: int, minutes: float) -> tuple[int, int]:
     """Return the first frame and the number of frames of the middle `minutes`, or of all frames if they are fewer."""
     wanted = min(frames, round(60 * minutes * FRAME_HZ))
     return (frames - wanted) // 2, wanted
-
-
-def _by_events(
-    model: EventModel,
-    calmness: Calmness,
-    person: MeetingPerson,
-    one: ListenerMeeting,
-    seeds: Sequence[int],
-    own_voice: bool,
-) -> Sums:
-    """Return how the hazards, given the person's history, rank the person's events; and the listener's decisions.
-
-    The hazards are also computed from the annotations, without the losses of sensing; and from those with all others
-    as one person, which is the loss of a single microphone.
-    """
-
-    def hazards(heard: Doubles) -> dict[str, Doubles]:
-        return hazards_in(model, heard, one.history, calmness)
-
-    with_voice, heard = sensed(one.speaker, calmness)
-    speaking, silent = delayed(hazards(with_voice)), hazards(heard)
-    other = hazards(sensed(shifted(one.speaker), calmness)[1])
-    sums = timing.hazard_sums("", one, speaking["nod"], silent["nod"], other["nod"])
-    scene, _ = meeting_scene(person)
-    for who, seen in (("annotated_", scene), ("one_voice_", one_voice(scene))):
-        sums |= timing.hazard_sums(who, one, *(hazards(each)["nod"] for each in annotated(seen, one.frames)))
-    for kind in timing.ANNOTATED:
-        sums[f"{kind}_hazard_auc"] = timing.ranked(speaking[kind], one, kind)
-    streams = decisions(model, with_voice if own_voice else heard, seeds, calmness)
-    return sums | timing.decided_sums(one, streams, own_voice)
 
 
 @cache
@@ -263,20 +255,7 @@ def _material(split: Split, data: Path) -> tuple[Sequence[VoiceClip], Sequence[F
 # --- the report -----------------------------------------------------------------------------------------------------
 
 
-def _notes(found: Mapping[str, Estimate], own_voice: bool) -> Iterator[str]:
-    """Yield what a reader of the figures has to know."""
-    yield "people's smiles and blinks were not annotated; laughs are compared with laughs only"
-    if own_voice:
-        yield "it spoke when the person did, so the contingency of its own nods on the others is unknown"
-    if "nod_hazard_auc" not in found:
-        yield "this listener has no hazards to evaluate: there is no nod_hazard_auc"
-    if "nods_per_minute" not in found:
-        yield "no motion was played"
-    if "r2_nod_hazard_auc" not in found:
-        yield "the tables have no training people to fit the reference on"
-
-
-def _rows(name: str, found: Mapping[str, Estimate]) -> list[dict[str, Any]]:
+def _rows(name: str, found: Mapping[str, Estimate]) -> list[Figures]:
     """Return one row per figure: of the motion or the hazards, beside the same figure of the other sources."""
 
     def bare(key: str) -> str:

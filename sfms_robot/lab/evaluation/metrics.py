@@ -160,7 +160,7 @@ def _pearson(a: Doubles, b: Doubles) -> Doubles:
     x, y = a - a.mean(axis=-2, keepdims=True), b - b.mean(axis=-2, keepdims=True)
     constant = (np.ptp(a, axis=-2) == 0) | (np.ptp(b, axis=-2) == 0)
     norm = np.sqrt((x**2).sum(axis=-2) * (y**2).sum(axis=-2))
-    return np.asarray(np.where(constant, np.nan, (x * y).sum(axis=-2) / np.where(constant, 1.0, norm)))
+    return np.where(constant, np.nan, (x * y).sum(axis=-2) / np.where(constant, 1.0, norm))
 
 
 def sts(target: Doubles, pred: Doubles) -> float:
@@ -204,7 +204,7 @@ def dtw(one: Doubles, many: Doubles) -> Doubles:
         now = np.full((count, rows + 1), np.inf)
         now[:, i + 1] = cost[:, i, diagonal - i] + best
         before, last = last, now
-    return np.asarray(np.sqrt(last[:, rows]), np.float64)
+    return np.sqrt(last[:, rows])
 
 
 def _mean_score(pred: Doubles, target: Doubles, score: Callable[[Doubles, Doubles], float]) -> float:
@@ -256,7 +256,7 @@ def frsyn(pred: Doubles, speaker: Doubles, as_challenge: bool = True) -> float:
 def mean_known(values: Doubles) -> float:
     """Return the mean of the finite values; NaN without any."""
     known = values[np.isfinite(values)]
-    return float(known.mean()) if len(known) else float("nan")
+    return float(known.mean()) if len(known) else np.nan
 
 
 def synchrony_lags(pred: Doubles, speaker: Doubles, as_challenge: bool) -> Doubles:

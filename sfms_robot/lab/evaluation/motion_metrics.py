@@ -10,13 +10,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, Doubles
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.collection import npy
 from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.intervals import estimates, quotient
@@ -49,7 +50,7 @@ def evaluate_metrics(
     space: str | None = None,
     frames: int | None = None,
     seed: int = 1,
-) -> dict[str, Any]:
+) -> Figures:
     """Return rows of `name`, `part`, `definition`, `value` and `interval`: 95 % over clips, None if clips are pooled.
 
     Files are `.npy` arrays, face tracks (CSV, also gzipped), or folders of face tracks, matched by name. Values are
@@ -66,7 +67,7 @@ def evaluate_metrics(
     Raises ConfigError for files that do not match.
     """
     scored = _read(truth, prediction, speaker, space, frames)
-    rows: list[dict[str, Any]] = []
+    rows: list[Figures] = []
     for part, where in tracked(PARTS.get(scored.space, {}).items(), "scoring motion"):
         rows += [{"part": part} | row for row in _part_rows(scored, part, where, seed)]
     rows += [{"part": "all"} | row for row in _react_rows(scored)]
@@ -86,12 +87,24 @@ def _read(
     given = {truth_file: truth, prediction_file: prediction}
     if speaker_file is not None:
         given[speaker_file] = _clips(speaker_file)
-    space = _space(space, truth_file, next(iter(truth.values())).shape[-1])
+    width = next(iter(truth.values())).shape[-1]
+    space = space or next((name for name, channels in WIDTHS.items() if channels == width), None)
+    if space is None:
+        raise ConfigError(f"{truth_file}: {width} channels, not {_SPACES}")
+    if space not in WIDTHS:
+        raise ConfigError(f"--space {space}: not one of {', '.join(WIDTHS)}")
     for path, clips in given.items():
         if list(clips) != list(truth):
             raise ConfigError(f"{path}: its clips ({_names(clips)}) are not those of {truth_file} ({_names(truth)})")
         for name, clip in clips.items():
-            _check(path, name, clip, WIDTHS[space], answers=clips is prediction)
+            if clip.ndim > 3 or (clip.ndim == 3 and clips is not prediction):
+                few = "only a prediction has several answers to a clip"
+                raise ConfigError(f"{path}: clip {name} has shape {clip.shape}; {few}")
+            if clip.shape[-1] != WIDTHS[space]:
+                wrong = f"{clip.shape[-1]} channels, not {WIDTHS[space]}"
+                raise ConfigError(f"{path}: clip {name} has {wrong}; known: {_SPACES}")
+            if not np.isfinite(clip).all():
+                raise ConfigError(f"{path}: clip {name} has values that are not finite (a face that was lost?)")
     lengths = {name: min(clips[name].shape[-2] for clips in given.values()) for name in truth}
     shortest = min(lengths.values())
     if frames is not None and frames > shortest:
@@ -131,26 +144,6 @@ def _track(file: Path) -> Doubles:
     return resample(read_track(file), FRAME_HZ).motion.astype(np.float64)
 
 
-def _space(space: str | None, file: Path, width: int) -> str:
-    found = space or next((name for name, channels in WIDTHS.items() if channels == width), None)
-    if found is None:
-        raise ConfigError(f"{file}: {width} channels, not {_SPACES}")
-    if found not in WIDTHS:
-        raise ConfigError(f"--space {found}: not one of {', '.join(WIDTHS)}")
-    return found
-
-
-def _check(path: Path, name: str, clip: Doubles, width: int, *, answers: bool) -> None:
-    if clip.ndim > 3 or (clip.ndim == 3 and not answers):
-        raise ConfigError(
-            f"{path}: clip {name} has shape {clip.shape}; only a prediction has several answers to a clip"
-        )
-    if clip.shape[-1] != width:
-        raise ConfigError(f"{path}: clip {name} has {clip.shape[-1]} channels, not {width}; known: {_SPACES}")
-    if not np.isfinite(clip).all():
-        raise ConfigError(f"{path}: clip {name} has values that are not finite (a face that was lost?)")
-
-
 def _names(clips: dict[str, Doubles]) -> str:
     names = list(clips)
     return ", ".join(names[:_SHOWN]) + (f", ... {len(names)} in all" if len(names) > _SHOWN else "")
@@ -159,7 +152,7 @@ def _names(clips: dict[str, Doubles]) -> str:
 # --- rows -----------------------------------------------------------------------------------------------------------
 
 
-def _part_rows(scored: _Scored, part: str, where: slice, seed: int) -> Iterator[dict[str, Any]]:
+def _part_rows(scored: _Scored, part: str, where: slice, seed: int) -> Iterator[Figures]:
     """Yield the Learning2Listen line's metrics of a part of the face."""
     truth, answers = scored.truth[..., where], scored.answers[..., where]
     by_clip: dict[str, Callable[[Doubles, Doubles], float]] = {  # of truth and answer of a clip
@@ -194,7 +187,7 @@ def _part_rows(scored: _Scored, part: str, where: slice, seed: int) -> Iterator[
         yield _row(name, float(np.mean([over_all(answers[:, k]) for k in range(answers.shape[1])])))
 
 
-def _react_rows(scored: _Scored) -> Iterator[dict[str, Any]]:
+def _react_rows(scored: _Scored) -> Iterator[Figures]:
     """Yield the REACT challenge's metrics."""
     answers, truth, samples = scored.answers, scored.truth, scored.answers.shape[1]
     correlation = metrics.frc(answers, truth)
@@ -216,7 +209,7 @@ def _react_rows(scored: _Scored) -> Iterator[dict[str, Any]]:
         yield _row("FRSyn: frames, constant channels left out", lag if np.isfinite(lag) else None)
 
 
-def _event_rows(scored: _Scored, seed: int) -> Iterator[dict[str, Any]]:
+def _event_rows(scored: _Scored, seed: int) -> Iterator[Figures]:
     """Yield nods, blinks and smiles per minute of the prediction and of the truth, by this project's detectors."""
     minutes = scored.truth.shape[1] / FRAME_HZ / 60.0
     for event, kind in MOTION_EVENTS.items():
@@ -225,13 +218,13 @@ def _event_rows(scored: _Scored, seed: int) -> Iterator[dict[str, Any]]:
             yield _over_clips(f"{event}s a minute: {whose}", rates, seed)
 
 
-def _over_clips(name: str, values: Sequence[Sequence[float]], seed: int) -> dict[str, Any]:
+def _over_clips(name: str, values: Sequence[Sequence[float]], seed: int) -> Figures:
     """Return the mean over (N, K) values, with its interval over clips."""
     clips = [{"sum": np.array([float(np.mean(answers)), 1.0])} for answers in values]
     found = estimates({"mean": quotient("sum")}, clips, seed)["mean"]
     return _row(name, found.value, found.interval)
 
 
-def _row(name: str, value: float | None, interval: tuple[float, float] | None = None) -> dict[str, Any]:
+def _row(name: str, value: float | None, interval: tuple[float, float] | None = None) -> Figures:
     metric, definition = name.split(": ", 1)
     return {"name": metric, "definition": definition, "value": value, "interval": interval and list(interval)}

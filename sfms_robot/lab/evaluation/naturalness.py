@@ -14,11 +14,10 @@ training loss.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import chain, cycle, islice, product
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -28,18 +27,17 @@ from torch import Tensor, nn
 
 from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE_CHANNELS, Bools, Doubles, Floats, SpeakerFrame, changed
+from sfms_robot.frames import CHANNELS, FRAME_HZ, FRAME_S, POSE_CHANNELS, Bools, Doubles, Floats, changed
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Dyad
-from sfms_robot.lab.corpora.collection import speaks, usable
-from sfms_robot.lab.corpora.conversion import at_frame_rate
-from sfms_robot.lab.corpora.formats import detect, open_for, split_names
+from sfms_robot.lab.corpora.collection import speaks
+from sfms_robot.lab.corpora.formats import detect, split_names
 from sfms_robot.lab.evaluation.detection import middle, movement, nods_of, slow_poses_deg
 from sfms_robot.lab.evaluation.intervals import Chosen, bootstrap, intervals, people_of, rounded
 from sfms_robot.lab.evaluation.phrase_timing import rank_auc
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread, streamable
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
-from sfms_robot.ports import Listener
 
 REGIONS: Final = {  # by the beginnings of their channels' names
     region: [index for index, name in enumerate(CHANNELS) if name.startswith(names)]
@@ -51,6 +49,7 @@ REGIONS: Final = {  # by the beginnings of their channels' names
         "brows": ("brow",),
     }.items()
 }
+ByDyad = Sequence[Floats]  # motion of each dyad, or windows of it
 FOLDS: Final = 5
 WINDOW: Final = 2 * FRAME_HZ
 _LOW_PASS_HZ: Final = 6.0
@@ -67,7 +66,7 @@ _CHUNK: Final = 512
 
 def evaluate_naturalness(
     name: str, data: Path, split: str, clips: int | None, drift_s: float, seed: int, engine: EngineName = "auto"
-) -> dict[str, Any]:
+) -> Figures:
     """Roll a listener out over the dyads of `split`, and compare its motion with that of their listeners.
 
     Raises ConfigError for fewer than ten dyads, and for people of training. Blocks for minutes and
@@ -76,15 +75,22 @@ def evaluate_naturalness(
     one_thread()
     if split == "train":
         raise ConfigError("--split train: listeners were trained on these people; validation and test are others")
-    dyads = spread([at_frame_rate(dyad) for dyad in usable(open_for("arkit58", data, split))], clips)
+    dyads = spread([*streamable(data, split)], clips)
     if len(dyads) < 2 * FOLDS:
         raise ConfigError(f"{data}: {len(dyads)} dyads of {split}; this comparison needs {2 * FOLDS} or more")
     listener = load_at_hop(name, engine=engine)
     heard = [frames_of_dyad(dyad) for dyad in dyads]
     listened = enumerate(tracked(heard, f"{name} listens"))
     ours = [rollout(listener, speaker, [seed + number]).motion[0] for number, speaker in listened]
-    long = long_run(listener, heard, drift_s, seed)
-    theirs, training = [dyad.listener for dyad in dyads], _training_windows(data, len(dyads))
+    # One stream hears one person after another.
+    frames = islice(cycle(chain.from_iterable(heard)), round(drift_s * FRAME_HZ))
+    timed = [changed(frame, time_s=number * FRAME_S) for number, frame in enumerate(frames, start=1)]
+    long = rollout(listener, timed, [seed], title="a long run").motion[0]
+    theirs, training = [dyad.listener for dyad in dyads], list[Floats]()
+    if "train" in split_names(*detect(data, "auto")):
+        some = [*streamable(data, "train", most=len(dyads))]
+        if len(some) == len(dyads):  # of as many listeners of the training split
+            training = listening(some, [dyad.listener for dyad in some])
     tests = two_samples(listening(dyads, ours), listening(dyads, theirs), training)
     addressed = [
         np.ones(len(dyad.listener), bool) if dyad.attention is None else np.asarray(dyad.attention > 0.5)
@@ -106,14 +112,14 @@ def evaluate_naturalness(
     }
 
 
-def notes(dyads: Sequence[Dyad], training: Sequence[Floats]) -> list[str]:
+def notes(dyads: Sequence[Dyad], training: ByDyad) -> list[str]:
     """Return what a reader of the figures has to know."""
     unknown = sum(dyad.attention is None for dyad in dyads)
     found = [f"the person's attention is unknown in {unknown} dyads: gaze counts all the time there"] if unknown else []
     return found if training else [*found, "too few dyads of training to compare its people with these"]
 
 
-def listening(dyads: Sequence[Dyad], motions: Sequence[Floats]) -> list[Floats]:
+def listening(dyads: Sequence[Dyad], motions: ByDyad) -> list[Floats]:
     """Return the windows (W, 50, 58) of each motion (N, 58) in which the dyad's listener is silent.
 
     A mouth that talks is judged by its words (`evaluate interaction`).
@@ -126,23 +132,7 @@ def listening(dyads: Sequence[Dyad], motions: Sequence[Floats]) -> list[Floats]:
     return found
 
 
-def _training_windows(data: Path, count: int) -> list[Floats]:
-    """Return the windows of `count` listeners of the training split; empty if there are fewer."""
-    if "train" not in split_names(*detect(data, "auto")):
-        return []
-    every = open_for("arkit58", data, "train")
-    some = [at_frame_rate(dyad) for dyad in usable(replace(every, clips=tuple(spread(every.clips, count))))]
-    return listening(some, [dyad.listener for dyad in some]) if len(some) == count else []
-
-
-def long_run(listener: Listener, heard: Sequence[Sequence[SpeakerFrame]], drift_s: float, seed: int) -> Floats:
-    """Return the motion (N, 58) of one stream that hears one person after another for `drift_s`."""
-    frames = islice(cycle(chain.from_iterable(heard)), round(drift_s * FRAME_HZ))
-    timed = [changed(frame, time_s=number * FRAME_S) for number, frame in enumerate(frames, start=1)]
-    return np.asarray(rollout(listener, timed, [seed], title="a long run").motion[0])
-
-
-def compared(ours: Mapping[str, float], theirs: Mapping[str, float]) -> dict[str, Any]:
+def compared(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Figures:
     """Return the figures of `movement` of both; None where there is no data."""
     figures = {**ours, **{f"people_{name}": value for name, value in theirs.items()}}
     return {name: rounded(value, 3) for name, value in figures.items()}
@@ -155,7 +145,7 @@ def nod_ratios(ours: Sequence[Doubles], theirs: Sequence[Doubles], chosen: Chose
     return {f"nod_{name}_ratio": middle(a) / middle(b) for name, a, b in figures}
 
 
-def drifted(motion: Floats, theirs: Sequence[Floats]) -> dict[str, Any]:
+def drifted(motion: Floats, theirs: ByDyad) -> Figures:
     """Return how far the head is from the middle at the end of a long run, and outside people's 1 to 99 %."""
     end = np.median(slow_poses_deg([motion])[-6:], axis=0)
     low, high = np.percentile(slow_poses_deg(theirs), [1, 99], axis=0)
@@ -170,7 +160,7 @@ def drifted(motion: Floats, theirs: Sequence[Floats]) -> dict[str, Any]:
 # --- two-sample tests -----------------------------------------------------------------------------------------------
 
 
-def two_samples(ours: Sequence[Floats], theirs: Sequence[Floats], training: Sequence[Floats]) -> dict[str, Any]:
+def two_samples(ours: ByDyad, theirs: ByDyad, training: ByDyad) -> Figures:
     """Return by region `two_sample_auc` of windows by dyad, each with its interval over dyads, and tests for scale.
 
     For scale: people against other people of the same split and, if `training` is given, people of training against
@@ -178,7 +168,7 @@ def two_samples(ours: Sequence[Floats], theirs: Sequence[Floats], training: Sequ
     against people of training. `levelled_`: each motion standardised by its own mean and deviation.
     """
     half = 2 * (len(theirs) // 2)
-    pairs: dict[str, tuple[Sequence[Floats], Sequence[Floats]]] = {
+    pairs: dict[str, tuple[ByDyad, ByDyad]] = {
         "two_sample_auc": (ours, theirs),
         "person_two_sample_auc": (theirs[:half:2], theirs[1:half:2]),
     }
@@ -187,7 +177,7 @@ def two_samples(ours: Sequence[Floats], theirs: Sequence[Floats], training: Sequ
     pairs |= {
         f"levelled_{name}": ([*map(levelled, one)], [*map(levelled, other)]) for name, (one, other) in pairs.items()
     }
-    found, interval = ({name: dict[str, Any]() for name in pairs} for _ in range(2))
+    found, interval = ({name: Figures() for name in pairs} for _ in range(2))
     for name, region in tracked(list(product(pairs, REGIONS)), "two-sample tests"):
         auc, *ends = separability(*pairs[name], region)
         found[name][region], interval[name][region] = round(auc, 3), [round(end, 3) for end in ends]
@@ -219,7 +209,7 @@ def levelled(part: Floats) -> Floats:
     return np.asarray((part - part.mean(axis=(0, 1))) / part.std(axis=(0, 1)).clip(min=1e-6), np.float32)
 
 
-def separability(ours: Sequence[Floats], theirs: Sequence[Floats], region: str) -> tuple[float, float, float]:
+def separability(ours: ByDyad, theirs: ByDyad, region: str) -> tuple[float, float, float]:
     """Return the area under the ROC curve and its 95 % interval over dyads, of windows (W, 50, 58) by dyad.
 
     Dyad d of both is the same dyad, or at least not a person of another one. Raises ValueError for fewer dyads than

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from itertools import combinations
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import soundfile
@@ -33,12 +33,10 @@ from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Doubles, Floats, SpeakerFrame
-from sfms_robot.lab.corpora.collection import usable
-from sfms_robot.lab.corpora.conversion import at_frame_rate
-from sfms_robot.lab.corpora.formats import open_for
+from sfms_robot.lab import Figures
 from sfms_robot.lab.evaluation.intervals import LEVEL, draw_people, ends
 from sfms_robot.lab.evaluation.robustness import unseen, voice_folders
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames, spread
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames, spread, streamable
 from sfms_robot.listeners.registry import load_listener, one_thread
 from sfms_robot.viewer.page_process import Address
 from sfms_robot.viewer.study_server import serve_study
@@ -107,12 +105,12 @@ class Study:
         """Return an anonymous name for a new participant, with which the page can resume later."""
         return secrets.token_hex(6)
 
-    def next(self, participant: str) -> dict[str, Any]:
+    def next(self, participant: str) -> Figures:
         """Return the participant's next trial, clips without their conditions' names; or that all is answered."""
         shown = self._trials(participant)
         done = {answer.trial for answer in self._answers if answer.participant == participant}
         left = [trial for trial in shown if trial.trial not in done]
-        found: dict[str, Any] = {"answered": len(shown) - len(left), "trials": len(shown)}
+        found: Figures = {"answered": len(shown) - len(left), "trials": len(shown)}
         if left:
             trial = left[0]
             found |= {"trial": trial.trial, "audio": f"voice-{trial.voice}.wav"}
@@ -138,10 +136,19 @@ class Study:
             Preference(participant=participant, question=question, chosen=sides[chosen[question]], **asdict(trial))
             for question in QUESTIONS
         ]
-        append_answers(self.folder / _ANSWERS, rows)
+        file = self.folder / _ANSWERS
+        try:
+            new = not file.is_file()
+            with file.open("a", encoding="utf-8", newline="") as lines:
+                table = csv.DictWriter(lines, _COLUMNS)
+                if new:
+                    table.writeheader()
+                table.writerows(map(asdict, rows))
+        except OSError as error:
+            raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
         self._answers += rows
 
-    def results(self) -> dict[str, Any]:
+    def results(self) -> Figures:
         return summary(self._answers)
 
     def _trials(self, participant: str) -> list[Trial]:
@@ -213,7 +220,13 @@ def prepare(
     clips.mkdir(parents=True, exist_ok=True)
     one_thread()
     for condition in tracked(conditions, "clips"):
-        for number, motion in enumerate(_motions(condition, heard, seed)):
+        listener = None if condition == RECORDED else load_listener(condition)
+        for number, each in enumerate(heard):
+            motion = each.recorded
+            if listener is not None:
+                played = rollout(listener, each.frames, [seed + _HOPS * number])
+                motion = played.motion[0, -(len(each.audio) // FRAME_SAMPLES) :]
+            assert motion is not None  # `_weights` asks for data
             motion.astype("<f4").tofile(clips / f"{clip_name(seed, condition, number)}.f32")
     for number, each in enumerate(heard):
         soundfile.write(clips / f"voice-{number}.wav", each.audio, AUDIO_HZ, subtype="PCM_16")
@@ -255,7 +268,7 @@ def _voices(data: Path | None, count: int, length: int) -> list[_StudyVoice]:
         found.append(_StudyVoice(name, frames[max(0, begin - warm_up) : end], sound, motion))
 
     if data is not None:
-        for dyad in map(at_frame_rate, usable(open_for("arkit58", data, "test"))):
+        for dyad in streamable(data, "test"):
             if dyad.audio is not None and len(dyad.speaker) >= length:
                 end = min(len(dyad.speaker), length + warm_up)
                 cut(dyad.name, frames_of_dyad(dyad), dyad.audio, dyad.listener, end)
@@ -267,17 +280,6 @@ def _voices(data: Path | None, count: int, length: int) -> list[_StudyVoice]:
     if len(found) < count:
         raise ConfigError(f"--voices {count}: there are {len(found)} of {length / FRAME_HZ:g} s or more")
     return spread(found, count)
-
-
-def _motions(condition: str, voices: Sequence[_StudyVoice], seed: int) -> list[Floats]:
-    """Return the motion (N, 58) to every voice."""
-    if condition == RECORDED:
-        return [each.recorded for each in voices if each.recorded is not None]
-    listener = load_listener(condition)
-    return [
-        rollout(listener, each.frames, [seed + _HOPS * number]).motion[0, -(len(each.audio) // FRAME_SAMPLES) :]
-        for number, each in enumerate(voices)
-    ]
 
 
 # --- answers --------------------------------------------------------------------------------------------------------
@@ -307,20 +309,7 @@ def _answer(file: Path, line: int, row: Mapping[str, str | None]) -> Preference:
     return answer
 
 
-def append_answers(file: Path, answers: Sequence[Preference]) -> None:
-    """Append answers to a CSV file. Raises ConfigError if it cannot be written."""
-    try:
-        new = not file.is_file()
-        with file.open("a", encoding="utf-8", newline="") as lines:
-            rows = csv.DictWriter(lines, _COLUMNS)
-            if new:
-                rows.writeheader()
-            rows.writerows(asdict(answer) for answer in answers)
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
-
-
-def summary(answers: Sequence[Preference]) -> dict[str, Any]:
+def summary(answers: Sequence[Preference]) -> Figures:
     """Return per question and pair of conditions: counts, share of the first, interval, p; and strengths."""
     conditions = sorted({name for answer in answers for name in (answer.left, answer.right)})
     rows, strengths = [], {}
@@ -341,10 +330,10 @@ def summary(answers: Sequence[Preference]) -> dict[str, Any]:
     }
 
 
-def _pair(question: str, first: str, second: str, asked: Sequence[Preference]) -> dict[str, Any]:
+def _pair(question: str, first: str, second: str, asked: Sequence[Preference]) -> Figures:
     here = [answer for answer in asked if {answer.left, answer.right} == {first, second}]
     wins = [sum(answer.chosen == name for answer in here) for name in (first, second)]
-    row: dict[str, Any] = {
+    row: Figures = {
         "question": question, "first": first, "second": second, "answers": len(here), "first_chosen": wins[0],
         "second_chosen": wins[1], "neither": len(here) - sum(wins), "share": None, "interval": None, "p": None,
     }  # fmt: skip
@@ -355,7 +344,7 @@ def _pair(question: str, first: str, second: str, asked: Sequence[Preference]) -
     return row
 
 
-def _strengths(conditions: Sequence[str], asked: Sequence[Preference]) -> dict[str, dict[str, Any]]:
+def _strengths(conditions: Sequence[str], asked: Sequence[Preference]) -> dict[str, Figures]:
     people = sorted({answer.participant for answer in asked})
     wins = np.zeros((len(people), len(conditions), len(conditions)))
     for answer in asked:
@@ -381,4 +370,4 @@ def bradley_terry(wins: Doubles) -> Doubles:
     for _ in range(_STEPS):
         strength = won / (met / (strength[:, None] + strength[None, :])).sum(axis=1)
         strength /= np.exp(np.log(strength).mean())
-    return np.asarray(np.log(strength))
+    return np.log(strength)

@@ -1,6 +1,6 @@
 """Timing of a listener's events relative to the other person's speech.
 
-Functions on arrays sampled at `rate_hz` (25 in this project). The phrase-end ratio compares two windows after the same
+Functions on frames at 25 Hz, where no other rate is named. The phrase-end ratio compares two windows after the same
 phrase ends, so a listener that nods at random gets 1.
 """
 
@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfms_robot.frames import Bools, Doubles
+from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, Bools, Doubles
 from sfms_robot.signals.events import runs
 
 AFTER_S: Final = (0.0, 0.8)  # right after a phrase end
@@ -23,7 +23,7 @@ QUIET_DB: Final = -66.0  # of full scale: nothing below is speech
 LISTENING_S: Final = 2.0  # the other person spoke this recently
 
 
-def voice_activity(audio: ArrayLike, rate_hz: int = 16_000, frame_s: float = 0.04) -> Bools:
+def voice_activity(audio: ArrayLike, frame_s: float = FRAME_S) -> Bools:
     """Detect speech per frame of `audio` (n,) by energy over an adaptive floor; an incomplete last frame is left out.
 
     The floor is the quietest twentieth of the 8 s around; the threshold lies 8 dB above it, but always 16 to 34 dB
@@ -32,7 +32,7 @@ def voice_activity(audio: ArrayLike, rate_hz: int = 16_000, frame_s: float = 0.0
     from scipy import ndimage
 
     samples = np.asarray(audio, np.float64)
-    size = int(round(rate_hz * frame_s))
+    size = round(AUDIO_HZ * frame_s)
     frames = len(samples) // size
     if not frames:
         return np.zeros(0, bool)
@@ -47,49 +47,51 @@ def voice_activity(audio: ArrayLike, rate_hz: int = 16_000, frame_s: float = 0.0
     return active
 
 
-def phrase_ends(voice_active: Bools, rate_hz: float) -> Doubles:
+def phrase_ends(voice_active: Bools) -> Doubles:
     """Return the seconds at which speech ends and at least 0.2 s of silence follow."""
-    need = int(np.ceil(PAUSE_S * rate_hz - 1e-9))
-    return np.array([start / rate_hz for start, end in runs(~voice_active) if start > 0 and end - start >= need])
+    need = int(np.ceil(PAUSE_S * FRAME_HZ - 1e-9))
+    return np.array([start / FRAME_HZ for start, end in runs(~voice_active) if start > 0 and end - start >= need])
 
 
-def listening_mask(voice_active: Bools, rate_hz: float, own_voice: Bools | None = None) -> Bools:
+def listening_mask(voice_active: Bools, own_voice: Bools | bool = False, rate_hz: float = FRAME_HZ) -> Bools:
     """Return True where the other spoke in the last 2 s (this instant included) and the listener is silent."""
     index = np.arange(len(voice_active))
     last = np.maximum.accumulate(np.where(voice_active, index, -(10**9)))
-    recent = index - last <= LISTENING_S * rate_hz
-    return recent if own_voice is None else recent & ~own_voice
+    return (index - last <= LISTENING_S * rate_hz) & np.logical_not(own_voice)
 
 
-def nods_per_minute(onsets_s: ArrayLike, listening: Bools, rate_hz: float) -> float:
+def nods_per_minute(onsets_s: ArrayLike, listening: Bools) -> float:
     """Return onsets inside listening time per minute of it; NaN without listening time."""
-    inside, minutes = _inside(onsets_s, listening, rate_hz)
-    return inside / minutes if minutes else float("nan")
+    inside, minutes = _inside(onsets_s, listening)
+    return inside / minutes if minutes else np.nan
 
 
-def _inside(onsets_s: ArrayLike, mask: Bools, rate_hz: float) -> tuple[int, float]:
-    index = np.round(np.asarray(onsets_s, np.float64) * rate_hz).astype(int)
+def minutes_of(mask: Bools) -> float:
+    """Return the minutes of the frames in which a mask is True."""
+    return float(mask.sum()) / FRAME_HZ / 60
+
+
+def _inside(onsets_s: ArrayLike, mask: Bools) -> tuple[int, float]:
+    index = np.round(np.asarray(onsets_s, np.float64) * FRAME_HZ).astype(int)
     index = index[(index >= 0) & (index < len(mask))]
-    return int(mask[index].sum()), float(mask.sum()) / rate_hz / 60
+    return int(mask[index].sum()), minutes_of(mask)
 
 
-def phrase_end_counts(
-    onsets_s: ArrayLike, ends_s: Doubles, listening: Bools, rate_hz: float
-) -> tuple[int, float, int, float]:
+def phrase_end_counts(onsets_s: ArrayLike, ends_s: Doubles, listening: Bools) -> tuple[int, float, int, float]:
     """Count onsets and minutes in the two windows after phrase ends, both within listening time.
 
     Returns (onsets after, minutes after, onsets later, minutes later): add them up over people, then divide.
     An instant that lies in both (of two phrase ends) counts in both; within one window it counts once.
     """
-    after, later = (window_after(ends_s, span_s, len(listening), rate_hz) & listening for span_s in (AFTER_S, LATER_S))
-    return (*_inside(onsets_s, after, rate_hz), *_inside(onsets_s, later, rate_hz))
+    after, later = (window_after(ends_s, span_s, len(listening)) & listening for span_s in (AFTER_S, LATER_S))
+    return (*_inside(onsets_s, after), *_inside(onsets_s, later))
 
 
-def window_after(ends_s: Iterable[float], span_s: tuple[float, float], size: int, rate: float) -> Bools:
+def window_after(ends_s: Iterable[float], span_s: tuple[float, float], size: int) -> Bools:
     """Return (size,), True in the window `span_s` after each instant of `ends_s`."""
     mask = np.zeros(size, bool)
     for end in ends_s:
-        first, last = (max(0, round(float(end + offset) * rate)) for offset in span_s)
+        first, last = (max(0, round(float(end + offset) * FRAME_HZ)) for offset in span_s)
         mask[first:last] = True
     return mask
 
@@ -101,15 +103,15 @@ def ratio_of(counts: Sequence[float]) -> float:
     """
     after, after_min, later, later_min = counts
     if not later or not after_min or not later_min:
-        return float("nan")
+        return np.nan
     return (after / after_min) / (later / later_min)
 
 
-def near(spans_s: Doubles, frames: int, rate_hz: float, within_s: float) -> Bools:
+def near(spans_s: Doubles, frames: int, within_s: float) -> Bools:
     """Return (frames,), True at instants that are at most `within_s` away from one of the spans (K, 2)."""
     mask = np.zeros(frames, bool)
     for start, end in spans_s.tolist():
-        first, last = math.ceil((start - within_s) * rate_hz - 1e-6), math.floor((end + within_s) * rate_hz + 1e-6)
+        first, last = math.ceil((start - within_s) * FRAME_HZ - 1e-6), math.floor((end + within_s) * FRAME_HZ + 1e-6)
         mask[max(0, first) : max(0, last + 1)] = True
     return mask
 
@@ -123,23 +125,23 @@ def rank_auc(scores: Doubles, positive: NDArray[Any], negative: NDArray[Any]) ->
 
     high, low = scores[positive], scores[negative]
     if not len(high) or not len(low):
-        return float("nan")
+        return np.nan
     ranks = stats.rankdata(np.concatenate([high, low]))[: len(high)]
     return float((ranks.sum() - len(high) * (len(high) + 1) / 2) / (len(high) * len(low)))
 
 
-def find_gaze_shifts(gaze: Doubles, rate_hz: float, least_rad: float = 0.14) -> list[float]:
+def find_gaze_shifts(gaze: Doubles, least_rad: float = 0.14) -> list[float]:
     """Return the seconds at which the gaze (N, 2) of head and eyes together jumps by 8 degrees or more.
 
     A jump is a change within 0.2 s from one quarter second of rest to the next; those closer than 0.3 s are one.
     """
     from scipy import signal
 
-    rest, jump = max(1, round(0.24 * rate_hz)), max(1, round(0.2 * rate_hz))
+    rest, jump = round(0.24 * FRAME_HZ), round(0.2 * FRAME_HZ)
     if len(gaze) < 2 * rest + jump:
         return []
     windows = np.lib.stride_tricks.sliding_window_view(gaze, rest, axis=0)
     settled = np.median(windows, axis=-1)  # [i]: frames i to i + rest
     size = np.hypot(*(settled[rest + jump :] - settled[: -rest - jump]).T)
-    peaks, _ = signal.find_peaks(np.r_[0.0, size, 0.0], height=least_rad, distance=max(1, round(0.3 * rate_hz)))
-    return [float((peak - 1 + rest + jump / 2) / rate_hz) for peak in peaks]
+    peaks, _ = signal.find_peaks(np.r_[0.0, size, 0.0], height=least_rad, distance=round(0.3 * FRAME_HZ))
+    return [float((peak - 1 + rest + jump / 2) / FRAME_HZ) for peak in peaks]

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from statistics import median
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 import soxr
@@ -42,12 +42,14 @@ from sfms_robot.frames import (
     SpeakerFrame,
     clip_shapes,
 )
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Split, split_of_voice
+from sfms_robot.lab.corpora.compose.motions import Rng
 from sfms_robot.lab.corpora.compose.render_events import lay_smile, speaker_motion
 from sfms_robot.lab.corpora.compose.voices import VOICE_FOLDERS, find_voices, mouth_over
 from sfms_robot.lab.evaluation.detection import seen
 from sfms_robot.lab.evaluation.intervals import mean_interval, rounded
-from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
+from sfms_robot.lab.evaluation.phrase_timing import listening_mask, minutes_of, voice_activity
 from sfms_robot.lab.evaluation.rollout import Rollout, rollout, run_in_processes, speaker_frames
 from sfms_robot.lab.evaluation.whole_recordings import decisions, event_spans, heard_in, scene_in
 from sfms_robot.listeners.events.evidence import AT
@@ -58,7 +60,8 @@ from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.motion_primitives import Motions, read_motions
 
 Inputs = Literal["voice", "face", "both"]
-Degrade = Callable[[Floats, np.random.Generator], Floats]
+Folders = tuple[Path, ...]
+Degrade = Callable[[Floats, Rng], Floats]
 
 # Events per minute of people in conversation: nods of AMI's listeners, median person and speaker-rich meetings.
 RANGES: Final = {"nod": (3.0, 7.0), "blink": (10.0, 25.0), "smile": (0.5, 1.5)}
@@ -77,7 +80,7 @@ def evaluate_robustness(
     seeds: int,
     seed: int,
     jobs: int | None,
-) -> dict[str, Any]:
+) -> Figures:
     """Return events per minute for every speaker in every condition, and their scatter over seeds, beside people's.
 
     Raises ConfigError, also for voices that listeners were trained on, or ModelError.
@@ -90,7 +93,7 @@ def evaluate_robustness(
     tasks = [(place, inputs, number) for place in range(len(everybody)) for inputs, number in cases()]
     work = partial(_play, name, voices, split, minutes, range(seed, seed + seeds))
     rows = run_in_processes(work, tasks, jobs, "speakers heard")
-    found: dict[str, Any] = {"returned_smiles": returned_smiles(voices, speakers, minutes, range(seed, seed + seeds))}
+    found: Figures = {"returned_smiles": returned_smiles(voices, speakers, minutes, range(seed, seed + seeds))}
     for kind in RANGES:
         rate_key, scatter_key = f"{kind}s_per_minute", f"{kind}s_variance_over_mean"
         values = [row[rate_key] for row in rows]
@@ -115,14 +118,14 @@ def evaluate_robustness(
 
 
 def _play(
-    listener: str, voices: tuple[Path, ...], split: Split, minutes: float, seeds: range, task: tuple[int, Inputs, int]
-) -> dict[str, Any]:
+    listener: str, voices: Folders, split: Split, minutes: float, seeds: range, task: tuple[int, Inputs, int]
+) -> Figures:
     """Play one speaker in one condition: places among the voices of `split`, and in `CONDITIONS`."""
     place, inputs, number = task
     speaker, condition = unseen(voices, split)[place], CONDITIONS[number]
     frames = heard_and_seen(speaker, inputs, condition, minutes, np.random.default_rng([seeds.start, place, number]))
     voice = np.resize(speaker.voice, len(frames) * FRAME_SAMPLES)  # as recorded
-    listened = float(listening_mask(voice_activity(voice), FRAME_HZ).sum()) / FRAME_HZ / 60
+    listened = minutes_of(listening_mask(voice_activity(voice)))
     return {
         "speaker": speaker.name,
         "inputs": inputs,
@@ -152,7 +155,7 @@ def motions_of(split: Split) -> Motions:
     return read_motions(data_dir("sim") / "listeners" / "motions.npz")[split]
 
 
-def voice_folders(data: Path | None) -> tuple[Path, ...]:
+def voice_folders(data: Path | None) -> Folders:
     """Return the folders of the bundled speakers and of the voices in a data folder."""
     if data is not None and not data.is_dir():
         raise ConfigError(f"--data {data}: no such folder")
@@ -160,7 +163,7 @@ def voice_folders(data: Path | None) -> tuple[Path, ...]:
     return (data_dir("sim") / "speakers", *brought)
 
 
-def unseen(voices: tuple[Path, ...], split: Split = "test") -> tuple[UnseenSpeaker, ...]:
+def unseen(voices: Folders, split: Split = "test") -> tuple[UnseenSpeaker, ...]:
     """Return all speakers in the folders whose voice is of `split`, by name. Raises ConfigError without any."""
     found = _kept(voices, split)
     if not found:
@@ -169,7 +172,7 @@ def unseen(voices: tuple[Path, ...], split: Split = "test") -> tuple[UnseenSpeak
 
 
 @cache
-def _kept(voices: tuple[Path, ...], split: Split) -> tuple[UnseenSpeaker, ...]:
+def _kept(voices: Folders, split: Split) -> tuple[UnseenSpeaker, ...]:
     """Return the speakers of `unseen`; none where no voice is kept for the split.
 
     The face has the speaker's own mouth if it was filmed, else another's that opens with the voice.
@@ -207,7 +210,7 @@ class InputCondition:
     mouth_moves: bool = True
 
 
-def noise(voice: Floats, rng: np.random.Generator) -> Floats:
+def noise(voice: Floats, rng: Rng) -> Floats:
     """Add noise that falls by 3 dB an octave, 10 dB below the voice."""
     spectrum = np.fft.rfft(rng.standard_normal(len(voice)))
     spectrum /= np.sqrt(np.maximum(np.arange(len(spectrum)), 1))
@@ -216,17 +219,17 @@ def noise(voice: Floats, rng: np.random.Generator) -> Floats:
     return _clipped(voice + level * pink)
 
 
-def quiet(voice: Floats, rng: np.random.Generator) -> Floats:
+def quiet(voice: Floats, rng: Rng) -> Floats:
     """Attenuate by 20 dB, as from across a room."""
     return _clipped(voice * 0.1)
 
 
-def loud(voice: Floats, rng: np.random.Generator) -> Floats:
+def loud(voice: Floats, rng: Rng) -> Floats:
     """Amplify by 12 dB and clip."""
     return _clipped(voice * 4.0)
 
 
-def room(voice: Floats, rng: np.random.Generator) -> Floats:
+def room(voice: Floats, rng: Rng) -> Floats:
     """Add as much sound from the walls as from the mouth, decaying by 60 dB in 0.6 s."""
     samples = round(_RT60_S * AUDIO_HZ)
     tail = rng.standard_normal(samples) * 10 ** (-3 * np.arange(samples) / samples)
@@ -234,13 +237,13 @@ def room(voice: Floats, rng: np.random.Generator) -> Floats:
     return _clipped((voice + walls) / np.sqrt(2))
 
 
-def telephone(voice: Floats, rng: np.random.Generator) -> Floats:
+def telephone(voice: Floats, rng: Rng) -> Floats:
     """Resample through 8 kHz."""
     narrow = soxr.resample(soxr.resample(voice, AUDIO_HZ, AUDIO_HZ // 2), AUDIO_HZ // 2, AUDIO_HZ)
     return _clipped(np.pad(narrow, (0, max(0, len(voice) - len(narrow))))[: len(voice)])
 
 
-def jitter(face: Floats, rng: np.random.Generator) -> Floats:
+def jitter(face: Floats, rng: Rng) -> Floats:
     """Add the scatter of a tracker: 0.3 degrees, 2 mm, 0.03 of a blendshape."""
     sizes = np.r_[np.full(3, np.deg2rad(0.3)), np.full(3, 2e-3), np.full(52, 0.03)]
     out = face + sizes * rng.standard_normal(face.shape)
@@ -248,26 +251,26 @@ def jitter(face: Floats, rng: np.random.Generator) -> Floats:
     return np.asarray(out, np.float32)
 
 
-def lost(face: Floats, rng: np.random.Generator) -> Floats:
+def lost(face: Floats, rng: Rng) -> Floats:
     """Lose the face for every second second."""
     out = face.copy()
     out[np.arange(len(face)) // FRAME_HZ % 2 == 1] = np.nan
     return out
 
 
-def constant(face: Floats, rng: np.random.Generator) -> Floats:
+def constant(face: Floats, rng: Rng) -> Floats:
     """Hold the first frame, like a tracker that hangs."""
     return np.repeat(face[:1], len(face), axis=0)
 
 
-def saturated(face: Floats, rng: np.random.Generator) -> Floats:
+def saturated(face: Floats, rng: Rng) -> Floats:
     """Set every blendshape to its maximum."""
     out = face.copy()
     out[:, SHAPES] = 1.0
     return out
 
 
-def upside_down(face: Floats, rng: np.random.Generator) -> Floats:
+def upside_down(face: Floats, rng: Rng) -> Floats:
     """Turn the camera upside down."""
     out = face.copy()
     out[:, POSE] *= -1
@@ -307,7 +310,7 @@ def cases() -> Iterator[tuple[Inputs, int]]:
 
 
 def heard_and_seen(
-    speaker: UnseenSpeaker, inputs: Inputs, condition: InputCondition, minutes: float, rng: np.random.Generator
+    speaker: UnseenSpeaker, inputs: Inputs, condition: InputCondition, minutes: float, rng: Rng
 ) -> list[SpeakerFrame]:
     """Return `minutes` of the speaker, repeated from the beginning if the recording is shorter."""
     frames = round(60 * minutes * FRAME_HZ)
@@ -329,9 +332,7 @@ SHIFT_S: Final = 60.0
 LEAST_MINUTES: Final = 3.0
 
 
-def returned_smiles(
-    voices: tuple[Path, ...], speakers: int | None, minutes: float, seeds: Sequence[int]
-) -> dict[str, Any]:
+def returned_smiles(voices: Folders, speakers: int | None, minutes: float, seeds: Sequence[int]) -> Figures:
     """Return what is decided for speakers who smile four times a minute, and for the same ones who never smile.
 
     `answered`: share of their smiles with one of the head's within 1.5 s; `shifted`: the same with theirs moved by a
@@ -345,7 +346,15 @@ def returned_smiles(
     for place, speaker in enumerate(tracked(people, "smiles returned")):
         rng = np.random.default_rng([seeds[0], place])
         plain = heard_and_seen(speaker, "both", CONDITIONS[0], length_s / 60, rng)
-        onsets_s, smiling = _smiling(plain, motions, rng)
+        face = np.array([frame.face.motion for frame in plain if frame.face is not None], np.float32)
+        every_s = 60 / THEIR_SMILES_A_MINUTE
+        onsets_s = np.arange(every_s / 2, len(face) * FRAME_S - every_s / 2, every_s)
+        onsets_s += rng.uniform(-every_s / 4, every_s / 4, len(onsets_s))
+        for start_s in onsets_s.tolist():
+            lay_smile(face[:, SHAPES], start_s, sizes.smile_s(rng), rng.uniform(*sizes.THEIR_SMILE), 0.1, motions, rng)
+        clip_shapes(face)
+        pairs = zip(plain, face, strict=True)
+        smiling = [replace(frame, face=FaceFrame.of(frame.time_s, row)) for frame, row in pairs]
         for own in decisions(model, heard_in(scene_in(smiling)), seeds, calm):
             begun_s = event_spans(own, "smile")[:, 0]
             moved_s = (onsets_s + SHIFT_S) % length_s
@@ -368,22 +377,6 @@ def returned_smiles(
         "never_smiles_per_minute": rounded(float(np.mean(rates_a_minute))),
         "false_per_minute": rounded(float(np.mean(false))),
     }
-
-
-def _smiling(
-    frames: Sequence[SpeakerFrame], motions: Motions, rng: np.random.Generator
-) -> tuple[Doubles, list[SpeakerFrame]]:
-    """Return the onsets [s] of smiles that are laid over the faces, four a minute, and the frames with them."""
-    face = np.array([frame.face.motion for frame in frames if frame.face is not None], np.float32)
-    every_s = 60 / THEIR_SMILES_A_MINUTE
-    onsets_s: Doubles = np.arange(every_s / 2, len(face) * FRAME_S - every_s / 2, every_s)
-    onsets_s += rng.uniform(-every_s / 4, every_s / 4, len(onsets_s))
-    for start_s in onsets_s.tolist():
-        lay_smile(face[:, SHAPES], start_s, sizes.smile_s(rng), rng.uniform(*sizes.THEIR_SMILE), 0.1, motions, rng)
-    clip_shapes(face)
-    return onsets_s, [
-        replace(frame, face=FaceFrame.of(frame.time_s, row)) for frame, row in zip(frames, face, strict=True)
-    ]
 
 
 def _share_followed(at_s: Doubles, begun_s: Doubles) -> float:
@@ -423,7 +416,7 @@ def rates(counts: Mapping[str, Sequence[int]], minutes: float, listened: float) 
     return figures
 
 
-def outside(row: Mapping[str, Any], tells_speech: bool = True) -> list[str]:
+def outside(row: Figures, tells_speech: bool = True) -> list[str]:
     """Return the figures of a row outside people's ranges; without evidence of speech, 0 is inside."""
     return [
         f"{kind}s_per_minute"

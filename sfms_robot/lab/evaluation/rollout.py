@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,7 +28,10 @@ from sfms_robot.config.listener import paper_state
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, SpeakerFrame
 from sfms_robot.lab.corpora.clips import Dyad
+from sfms_robot.lab.corpora.collection import Order, usable
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
+from sfms_robot.lab.corpora.conversion import at_frame_rate
+from sfms_robot.lab.corpora.formats import open_for
 from sfms_robot.lab.learning.sfms.features import frames_of, keyframe_tokens, place_all
 from sfms_robot.listeners.arig.stream import ArigMemory
 from sfms_robot.listeners.capacity import step_each
@@ -84,6 +88,16 @@ def spread(items: Sequence[_Task], most: int | None) -> list[_Task]:
 
 
 # --- what a listener hears ------------------------------------------------------------------------------------------
+
+
+def streamable(data: Path, split: str, order: Order | None = None, most: int | None = None) -> Iterator[Dyad]:
+    """Open a split, and yield its dyads as a listener is streamed through them: in arkit58, at 25 fps.
+
+    At most `most` of them, spread over the set; those that cannot be read are left out (`usable`). `order`: see
+    `open_dataset`. Raises ConfigError.
+    """
+    every = open_for("arkit58", data, split, order)
+    return map(at_frame_rate, usable(replace(every, clips=tuple(spread(every.clips, most)))))
 
 
 def speaker_frames(

@@ -34,7 +34,7 @@ from sfms_robot.lab.learning.sfms.tokenizer_trainer import amplified, loss_of_st
 from sfms_robot.lab.learning.train_runs import device_of
 from sfms_robot.lab.learning.training_loop import checkpoint_file, fit, optimizer
 from sfms_robot.listeners.sfms.model import Tokenizer
-from sfms_robot.listeners.sfms.placement import ConditionalScore, ScoreNetwork, place, tracks
+from sfms_robot.listeners.sfms.placement import ScoreNetwork, place, tracks
 from sfms_robot.signals.tracks import Take
 
 if TYPE_CHECKING:
@@ -178,7 +178,15 @@ def snapshots(tokenizer: Tokenizer | DenseTokenizer, watched: Tensor, step: int)
         return []
     # Keyframes by the scores alone, without the corrections of `sweeps`.
     mask = place(watched, tokenizer.keyframes, tokenizer.strategy, member=tokenizer.member, score=tokenizer.score)
-    scores = _first_choice(tokenizer, watched)
+    score = tokenizer.score
+    if isinstance(score, ScoreNetwork):
+        scores = torch.log_softmax(score(watched), dim=1)
+    else:  # of the first choice alone
+        track = tracks(watched, tokenizer.member, score.curves)
+        w, t, _ = watched.shape
+        counts = torch.tensor(tokenizer.keyframes).repeat(w)
+        logits = torch.log_softmax(score(track, watched.new_zeros(len(counts), t), counts), dim=1)
+        scores = logits.view(w, len(tokenizer.keyframes), t).transpose(1, 2)
     errors = (tokenizer.decode(tokenizer.encode(watched, mask)) - watched).square().mean(-1)
     busy = (watched.var(1) @ tokenizer.member.T / tokenizer.member.sum(1)).argmax(1)
     return [
@@ -203,19 +211,6 @@ def load_history(folder: Path) -> list[Snapshot]:
         return _SNAPSHOTS.validate_json(file.read_bytes())
     except ValueError as error:
         raise ModelError(f"{file}: not the history of a tokenizer: {error}") from error
-
-
-def _first_choice(tokenizer: Tokenizer, motion: Tensor) -> Tensor:
-    """Return the log-probabilities (W, T, G) of the first choice."""
-    score = tokenizer.score
-    if isinstance(score, ScoreNetwork):
-        return torch.log_softmax(score(motion), dim=1)
-    assert isinstance(score, ConditionalScore)
-    track = tracks(motion, tokenizer.member, score.curves)
-    w, t, _ = motion.shape
-    counts = torch.tensor(tokenizer.keyframes).repeat(w)
-    logits = torch.log_softmax(score(track, motion.new_zeros(len(counts), t), counts), dim=1)
-    return logits.view(w, len(tokenizer.keyframes), t).transpose(1, 2)
 
 
 def _rounded(curve: Tensor) -> list[float]:

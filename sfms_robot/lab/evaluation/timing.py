@@ -25,7 +25,7 @@ from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, gaze_rad
 from sfms_robot.lab.evaluation.intervals import Figure, Sums, added, distance, median, quotient, ratio
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, ListenerMeeting, frames_before
-from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts
+from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts, minutes_of
 from sfms_robot.lab.evaluation.whole_recordings import event_spans
 from sfms_robot.lab.learning.events.event_trainer import listening_in
 from sfms_robot.signals import phase
@@ -47,10 +47,6 @@ CELLS: Final = (len(_SILENCE_S) + 1 + len(_SPEECH_S) + 1) * (len(_LAST_S) + 1)
 Runs = Sequence[Doubles]  # spans (K, 2) [s] of events, once for each seed
 
 
-def _minutes(mask: Bools) -> float:
-    return float(mask.sum()) / FRAME_HZ / 60
-
-
 def _pooled(onsets: Sequence[Ints]) -> Ints:
     return np.concatenate([np.zeros(0, np.int64), *onsets])
 
@@ -61,14 +57,14 @@ def _pooled(onsets: Sequence[Ints]) -> Ints:
 def times_of(one: ListenerMeeting) -> dict[str, Bools]:
     """Return masks (N,) of the times in which nods are counted; `after_phrase` over `later` is the phrase-end ratio."""
     frames, listening = one.frames, one.listening
-    ends = phrase_timing.phrase_ends(one.others, FRAME_HZ)
+    ends = phrase_timing.phrase_ends(one.others)
     silence_s = phase.times(one.others)[:, 1]
     return {
         "nods_per_minute": listening,
         "addressed_nods_per_minute": one.addressed,
         "bystander_nods_per_minute": one.bystander,
-        "nods_after_phrase": phrase_timing.window_after(ends, phrase_timing.AFTER_S, frames, FRAME_HZ) & listening,
-        "nods_later": phrase_timing.window_after(ends, phrase_timing.LATER_S, frames, FRAME_HZ) & listening,
+        "nods_after_phrase": phrase_timing.window_after(ends, phrase_timing.AFTER_S, frames) & listening,
+        "nods_later": phrase_timing.window_after(ends, phrase_timing.LATER_S, frames) & listening,
         "nods_long_silence": (silence_s > _LONG_SILENCE_S) & ~one.own & ~one.unseen,
     }
 
@@ -82,7 +78,7 @@ def nod_sums(who: str, one: ListenerMeeting, runs: Runs, within: Bools | None = 
     onsets = [np.round(nods[:, 0] * FRAME_HZ).astype(np.int64).clip(0, one.frames - 1) for nods in runs]
     every, heard = _pooled(onsets), one.listening & played
     sums = {
-        who + name: np.array([per_seen * (mask & played)[every].sum(), len(runs) * _minutes(mask & played)])
+        who + name: np.array([per_seen * (mask & played)[every].sum(), len(runs) * minutes_of(mask & played)])
         for name, mask in times_of(one).items()
     }
     sums[who + "nods_variance_over_mean"] = np.sum([np.zeros(2), *(scatter(begun, heard) for begun in onsets)], axis=0)
@@ -115,7 +111,7 @@ def scatter(onsets: Ints, listening: Bools) -> Doubles:
 def _other_sums(who: str, one: ListenerMeeting, kind: str, runs: Runs) -> Sums:
     """Return events of another kind than nods and minutes of listening; "mm-hm" begins where listening ends."""
     begun = _pooled([frames_before(spans[:, 0], one.frames) for spans in runs])
-    counts = [one.listening[begun].sum(), len(runs) * _minutes(one.listening)]
+    counts = [one.listening[begun].sum(), len(runs) * minutes_of(one.listening)]
     return {f"{who}{kind}s_per_minute": np.array(counts, np.float64)}
 
 
@@ -171,7 +167,7 @@ def motion_sums(
         "blinks_per_minute": np.array([sum(map(len, found["blink"])), minutes]),
         "smiles_per_minute": np.array([sum(map(len, found["smile"])), minutes]),
         "gaze_shifts_per_minute": np.array(
-            [sum(len(find_gaze_shifts(gaze_rad(motion), FRAME_HZ)) for motion in motions), minutes]
+            [sum(len(find_gaze_shifts(gaze_rad(motion))) for motion in motions), minutes]
         ),
     }
 
@@ -237,7 +233,7 @@ def nod_contingency(who: str, runs: Runs, one: ListenerMeeting, within: Bools) -
     heard another minute is its behaviour at that time: its nods are shifted, by every whole minute of the played part.
     """
     played = np.flatnonzero(within)
-    share = np.mean([phrase_timing.near(nods, one.frames, FRAME_HZ, _WITHIN_S) for nods in runs], axis=0)
+    share = np.mean([phrase_timing.near(nods, one.frames, _WITHIN_S) for nods in runs], axis=0)
     step = round(SHIFT_S * FRAME_HZ)
     moved = []
     for shift in range(step, len(played) - step + 1, step):

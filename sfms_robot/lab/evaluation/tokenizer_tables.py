@@ -23,7 +23,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from sfms_robot.app.progress import tracked
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import SHAPES, Doubles
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import read_takes
 from sfms_robot.lab.evaluation.intervals import LEAST_SEEDS, verdict
 from sfms_robot.lab.evaluation.metrics import dtw
@@ -99,14 +100,14 @@ def needed(name: str, shipped: bool = False) -> list[str]:
 
 def build(
     name: str, models: Mapping[str, TableModel], seen: Windows, seeds: int = 1
-) -> tuple[dict[str, Any], dict[str, Doubles]]:
+) -> tuple[Figures, dict[str, Doubles]]:
     """Score those tokenizers of a table that are present; return its JSON, and the errors (W,) of its rows by label.
 
     With several seeds a row is that of the first, but its `mse` is the mean over all, and `mse_by_seed` has each.
     """
     truth = _doubles(next(iter(models.values())).standardise(seen.motion))
     clusters = cluster(truth) if len(truth) >= 4 else None
-    rows, errors = list[dict[str, Any]](), {}
+    rows, errors = list[Figures](), {}
     for spec in tracked([*TABLES[name]], f"scoring table {name}"):
         each = [_scored(spec, models[one], seen, clusters) for one in seeded(spec.tokenizer, seeds) if one in models]
         if each:
@@ -116,17 +117,19 @@ def build(
                 row |= {"mse": float(np.mean(mse)), "mse_by_seed": mse}
             rows.append(row)
             errors[f"{spec.name}, {row['bits_per_window']:,.0f} bits"] = wrong
+    wanted = {spec.name for spec in TABLES[name] if spec.tokenizer in COMPARED["shipped"]}
+    whole = name in PAPER_TABLES and wanted <= {row["name"] for row in rows}  # else ratios would lack some
     table = {
         "table": int(name) if name in PAPER_TABLES else name,
         "rows": rows,
-        **({"ratios": ratios} if (ratios := _ratios(name, rows)) else {}),
+        **({"ratios": ratios_3(rows) if name == "3" else ratios_4(rows)} if whole else {}),
         **({"claims": claims(rows)} if name == "3-placements" else {}),
         "truth_silhouette": clusters and round(integrity(truth, truth, clusters)[0], 3),
     }
     return table, errors
 
 
-def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | None) -> tuple[dict[str, Any], Doubles]:
+def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | None) -> tuple[Figures, Doubles]:
     """Return a row as in JSON, and the squared errors (W,) of the windows."""
     motion = model.standardise(seen.motion)
     sparse = isinstance(model.tokenizer, Tokenizer)
@@ -184,7 +187,7 @@ def placed(model: TableModel, motion: Tensor, mask: Tensor) -> dict[str, float]:
     return {name: round(value, 3) for name, value in found.items()}
 
 
-def claims(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def claims(rows: Sequence[Figures]) -> list[Figures]:
     """Return, by inpainter and k, the error of learned keyframes over that of even ones, and if the paper's word holds.
 
     The paper states that learned ones have less. The interval of `verdict` is the range over three seeds or more.
@@ -220,15 +223,7 @@ def _doubles(motion: Tensor) -> Doubles:
     return np.asarray(motion.double().numpy(), np.float64)
 
 
-def _ratios(name: str, rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Return the ratios of a paper's table; empty of another one, and where rows are left out."""
-    wanted = {spec.name for spec in TABLES[name] if spec.tokenizer in COMPARED["shipped"]}
-    if name not in PAPER_TABLES or not wanted <= {row["name"] for row in rows}:
-        return {}
-    return ratios_3(rows) if name == "3" else ratios_4(rows)
-
-
-def ratios_3(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
+def ratios_3(rows: Sequence[Figures]) -> dict[str, dict[str, float]]:
     """Return the MSE of dynamic over other placements by k, one keyframe set per channel, here and in the paper."""
     mse = {(row["name"], row["k"]): row["mse"] for row in rows if not row["note"]}
     paper_e2 = {(spec.name, spec.k): spec.paper_e2 or np.nan for spec in TABLES["3"] if not spec.note}
@@ -243,7 +238,7 @@ def ratios_3(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, float]]:
     return {**found, "paper_dynamic_to_static": paper}
 
 
-def ratios_4(rows: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+def ratios_4(rows: Sequence[Figures]) -> dict[str, float]:
     """Return the MSE of Sparse-FSQ-256, ours and as written, over the dense and the grouped tokenizer."""
     mse = {row["name"]: row["mse"] for row in rows}
     paper_e2 = {spec.name: spec.paper_e2 or np.nan for spec in TABLES["4"]}
@@ -343,7 +338,7 @@ def evaluate_table(
     only: str = "*",
     jobs: int = 1,
     plots: Path | None = None,
-) -> dict[str, Any]:
+) -> Figures:
     """Score one table, or all; return the JSON object. Raises ConfigError, ModelError.
 
     Args:

@@ -325,11 +325,17 @@ def hazards_in(
     away = np.array([event.target_rad != AT_PERSON for event in own if event.kind == "gaze_shift"], bool)
     done = done_at(spans_s, now_s, _log_rate(model, calmness), away)
     asked_hz = _chances(model, heard[steps], done, calmness) / STEP_S
-    may = _may_happen(heard[steps], spans_s, away, now_s)
+    under_way = {}
+    for kind, spans in spans_s.items():
+        newest = np.searchsorted(spans[:, 0], now_s - EPS_S) - 1
+        lasts_until_s = np.where(away, np.inf, 0.0) if kind == "gaze_shift" else np.maximum.accumulate(spans[:, 1])
+        under_way[kind] = (newest >= 0) & (np.r_[lasts_until_s, 0.0][newest] > now_s)
     hazards_hz = {kind: np.zeros(len(heard)) for kind in EVENT_KINDS}
     for at, kind in enumerate(model.bank.kinds):
         if calmness.per_minute(kind) != 0:
-            held = np.repeat(np.where(may[kind], asked_hz[:, at], 0.0), STEP_FRAMES)
+            excluded = np.any([under_way[other] for other in EXCLUDES[kind]], axis=0)
+            may = ~excluded & _answers(kind, heard[steps])
+            held = np.repeat(np.where(may, asked_hz[:, at], 0.0), STEP_FRAMES)
             hazards_hz[kind][STEP_FRAMES - 1 :] = held[: len(heard) - STEP_FRAMES + 1]
     return hazards_hz
 
@@ -392,20 +398,7 @@ def _answers(kind: str, heard: Doubles) -> Bools:
     answered = spoken & (heard[:, AT["silence_s"]] <= LISTENING_S)  # another person has spoken just now
     if kind == "smile":
         answered |= heard[:, AT["others_smile_s"]] <= LISTENING_S
-    return np.asarray(answered & (heard[:, AT["own_voice_s"]] > 0))
-
-
-def _may_happen(heard: Doubles, spans_s: Mapping[str, Doubles], away: Bools, now_s: Doubles) -> dict[str, Bools]:
-    """Return (M,) by kind whether it may begin, by listening and by the events under way."""
-    under_way = {}
-    for kind, spans in spans_s.items():
-        newest = np.searchsorted(spans[:, 0], now_s - EPS_S) - 1
-        lasts_until_s = np.where(away, np.inf, 0.0) if kind == "gaze_shift" else np.maximum.accumulate(spans[:, 1])
-        under_way[kind] = (newest >= 0) & (np.r_[lasts_until_s, 0.0][newest] > now_s)
-    return {
-        kind: ~np.any([under_way[other] for other in EXCLUDES[kind]], axis=0) & _answers(kind, heard)
-        for kind in EVENT_KINDS
-    }
+    return answered & (heard[:, AT["own_voice_s"]] > 0)
 
 
 # --- Decisions -------------------------------------------------------------------------------------------------------

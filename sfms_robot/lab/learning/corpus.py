@@ -27,6 +27,7 @@ from sfms_robot import config
 from sfms_robot.config.listener import GAZE_CHANNELS
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, FRAME_HZ, Doubles, Floats, ListenerEvent
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import usable
 from sfms_robot.lab.learning.job import ALONE, Run
@@ -105,12 +106,21 @@ class Corpus(Generic[Frames]):
             return self
         return replace(self, frames=_each(self.frames, lambda part: part.to(device)))
 
-    def fingerprint(self) -> dict[str, Any]:
+    def fingerprint(self) -> Figures:
         """Return plain data that differ between corpora. The corpus must be on the CPU."""
         digest = hashlib.blake2b(repr((self.lengths, self.scenes)).encode(), digest_size=8)
         for tensor in vars(self.frames).values():
             digest.update(tensor.contiguous().numpy().data)
         return {"dyads": len(self.lengths), "frames": sum(self.lengths), "digest": digest.hexdigest()}
+
+    def identity(self, settings: AnyTraining, name: str, phase: config.Phase) -> Figures:
+        """Return the `Job.identity` of a phase that learns from these frames. The corpus must be on the CPU."""
+        return {
+            "seed": settings.seed,
+            "listener": settings.listener.model_dump(mode="json"),
+            name: phase.identity(),
+            "data": self.fingerprint(),
+        }
 
 
 def _each(frames: Frames, change: Callable[[Tensor], Tensor]) -> Frames:
@@ -301,7 +311,7 @@ def _stage(frames: DataclassInstance, folder: Path, first: bool) -> None:
 def read_staged(like: Frames, folder: Path) -> Corpus[Frames]:
     """Return the corpus whose frames lie in a folder, with the fields and types of `like`. Raises ConfigError."""
     try:
-        index: dict[str, Any] = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
+        index: Figures = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ConfigError(f"{folder}: the first process of this machine has staged no frames ({error})") from error
     rows, found = sum(index["lengths"]), {}
@@ -331,7 +341,7 @@ PACK_VERSION: Final = 1
 _MADE_FOR: Final = ("kind", "motion_space", "neutral", "metres_per_unit", "sound", "audio", "phase", "events", "sway")
 
 
-def _made_for(settings: AnyTraining) -> dict[str, Any]:
+def _made_for(settings: AnyTraining) -> Figures:
     """Return the settings that frames depend on, as plain data."""
     windows = settings.training if isinstance(settings, config.ArigTraining) else settings.listener
     known = settings.listener.model_dump(mode="json")

@@ -21,10 +21,7 @@ from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats, ListenerEvent
-from sfms_robot.lab.corpora.collection import usable
-from sfms_robot.lab.corpora.conversion import at_frame_rate
-from sfms_robot.lab.corpora.formats import open_for
-from sfms_robot.lab.evaluation.rollout import rollouts, spread
+from sfms_robot.lab.evaluation.rollout import rollouts, streamable
 from sfms_robot.listeners.checkpoint import load_config
 from sfms_robot.listeners.idle import FILE, IDLE_BANDS, IDLE_BANDS_HZ, KNOTS, MOUTH, STEEPEST, IdleMotion
 from sfms_robot.listeners.registry import load_folder, one_thread
@@ -82,10 +79,12 @@ def fit_idle(theirs: Sequence[Floats], ours: Sequence[Floats]) -> IdleMotion:
             loading[rows] = np.sqrt(by_band.sum()) * pattern
             loadings.append(loading)
             amplitudes.append(np.sqrt(by_band / by_band.sum()))
+    # How much people move, of those seen for ten seconds or more.
+    sizes = [np.log(windows.std(axis=(0, 1)).mean() + 1e-9) for windows in people if len(windows) * 2 >= 10]
     idle = IdleMotion(
         np.array(loadings, np.float32).reshape(-1, len(BLENDSHAPES)),
         np.array(amplitudes, np.float32).reshape(-1, IDLE_BANDS).T,
-        _spread(people),
+        float(np.clip(np.std(sizes), 0, 1)) if len(sizes) > 1 else 0.0,
         *np.zeros((2, KNOTS, len(BLENDSHAPES)), np.float32),
     )
     held, shown = _quantiles(idle, people, listener)
@@ -144,12 +143,6 @@ def covariances(faces: Sequence[Floats]) -> Doubles:
     return found
 
 
-def _spread(faces: Sequence[Floats]) -> float:
-    """Return the deviation of the logarithm of how much people move, of those seen for ten seconds or more."""
-    sizes = [np.log(windows.std(axis=(0, 1)).mean() + 1e-9) for windows in faces if len(windows) * 2 >= 10]
-    return float(np.clip(np.std(sizes), 0, 1)) if len(sizes) > 1 else 0.0
-
-
 # --- Behind `train idle`: what a trained listener leaves out of the small motion of resting faces, into its folder
 
 SHOWN: Final = 8  # channels that move most, in the figures
@@ -168,8 +161,7 @@ def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
         raise ConfigError(
             f"{folder}: expected a listener with events; without them rest and events cannot be separated"
         )
-    every = open_for("arkit58", data, "train")
-    chosen = [at_frame_rate(dyad) for dyad in usable(replace(every, clips=tuple(spread(every.clips, clips))))]
+    chosen = [*streamable(data, "train", most=clips)]
     if not chosen or any(dyad.events is None for dyad in chosen):
         raise ConfigError(
             f"{data}: expected dyads with events of listeners; without blinks and smiles rest cannot be found"

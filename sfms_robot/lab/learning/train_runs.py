@@ -34,6 +34,7 @@ from sfms_robot.frames import (
     Doubles,
     ListenerEvent,
 )
+from sfms_robot.lab import Figures
 from sfms_robot.lab.bench.measure import memory_mb
 from sfms_robot.lab.bench.operation_count import OperationCount
 from sfms_robot.lab.corpora.clips import Dyad, samples_of
@@ -68,7 +69,6 @@ from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.listeners.torch_engine import torch_engine
 
-Figures = dict[str, Any]  # for JSON
 DEVICES = ("auto", "cpu", "cuda")
 
 

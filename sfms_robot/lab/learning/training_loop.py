@@ -295,7 +295,8 @@ class Gradients:
         mine = range(self.group.rank, self._pieces, self.group.size)
         total = torch.zeros((), dtype=torch.float64, device=self.job.device)
         for piece in mine:
-            seed = _seed(self.job.seed, step, piece)
+            digest = hashlib.blake2b(f"{self.job.seed} {step} {piece}".encode(), digest_size=7)
+            seed = int.from_bytes(digest.digest(), "big")
             torch.manual_seed(seed)  # of dropout
             quiet = isinstance(self._loss, DistributedDataParallel) and piece != mine[-1]
             with self._loss.no_sync() if quiet else nullcontext():  # type: ignore[operator]
@@ -347,11 +348,6 @@ class _Loss(nn.Module):
 
     def forward(self, step: int, generator: Generator, samples: int) -> Tensor:
         return self._loss_of(step, generator, samples)
-
-
-def _seed(seed: int, step: int, piece: int) -> int:
-    digest = hashlib.blake2b(f"{seed} {step} {piece}".encode(), digest_size=7)
-    return int.from_bytes(digest.digest(), "big")
 
 
 # --- Checkpoints -----------------------------------------------------------------------------------------------------

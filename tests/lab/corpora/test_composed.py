@@ -144,7 +144,7 @@ def test_phrases_sound_when_they_were_said(tables, made):
         person = people[meeting, agent]
         if not len(person.others) or agent == "A":
             continue
-        heard = phrase_ends(voice_activity(dyad.audio), FRAME_HZ)
+        heard = phrase_ends(voice_activity(dyad.audio))
         for end in person.others[:, 1] - float(start):
             if 1.5 < end < len(dyad.listener) / FRAME_HZ - 1:  # the name rounds the start down to a second
                 assert (np.abs(heard - end) < 1.15).any()
@@ -376,7 +376,7 @@ def test_a_voice_fills_exactly_its_segments_and_a_mouth_moves_only_in_them(katie
         inside |= (times >= start) & (times < end)
     assert mouth is None
     assert not audio[~inside].any()
-    assert phrase_ends(voice_activity(audio), FRAME_HZ)[:2] == pytest.approx([2.5, 9.0], abs=0.13)
+    assert phrase_ends(voice_activity(audio))[:2] == pytest.approx([2.5, 9.0], abs=0.13)
     voice = read_voice(data_dir("sim") / "speakers" / "facegood_1114_3_16" / "speech.flac")
     _, mouth = lay(np.array([[2.0, 6.0]]), 250, voice, np.random.default_rng(0))
     assert mouth[:, BLENDSHAPES.index("jawOpen")].max() > 0.1 and not mouth[:48].any() and not mouth[153:].any()

@@ -59,7 +59,7 @@ def test_phrases_end_when_they_did_in_any_room_but_the_noisiest(katie):
         speech, _ = lay(np.array([[1.0, 3.0], [4.5, 7.0]]), 10 * FRAME_HZ, katie, rng)
         audio = heard(speech, katie, rng)
         assert audio.shape == speech.shape and np.abs(audio).max() <= 1
-        ends = phrase_ends(voice_activity(audio), FRAME_HZ)
+        ends = phrase_ends(voice_activity(audio))
         late += [np.abs(ends - end).min(initial=10.0) for end in (3.0, 7.0)]
     assert np.mean(np.array(late) < 0.3) > 0.85
 

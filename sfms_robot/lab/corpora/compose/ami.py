@@ -157,7 +157,7 @@ def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
     before = spans[:, 0] - np.r_[-np.inf, spans[:-1, 1]]
     after = np.r_[spans[1:, 0], np.inf] - spans[:, 1]
     short = spans[:, 1] - spans[:, 0] < _SHORT_S
-    return np.asarray(spans[short & (before >= _ALONE_S) & (after >= _ALONE_S)], np.float64)
+    return np.asarray(spans[short & (before >= _ALONE_S) & (after >= _ALONE_S)])
 
 
 def split_series(people: Iterable[MeetingPerson]) -> dict[Split, list[MeetingPerson]]:

@@ -33,12 +33,11 @@ import numpy as np
 from sfms_robot.app.progress import Progress, no_progress
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Bools, Doubles, Floats
+from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, SHAPES, Bools, Doubles, Floats, clip_shapes
 from sfms_robot.lab.corpora.clips import SPLITS, Dyad, Split, save
 from sfms_robot.lab.corpora.compose import speaking
 from sfms_robot.lab.corpora.compose.ami import (
     LabelledSpan,
-    LabelledSpans,
     MeetingPerson,
     interval_table,
     read_people,
@@ -273,14 +272,14 @@ def stretches(people: Sequence[MeetingPerson], rng: Rng, scene: Scene = "listeni
             piece = Stretch(person=person, start_s=at, end_s=at + length)
             at += length
             own, others = (active(spans, piece) for spans in (person.talk, person.others))
-            listening = listening_mask(others, FRAME_HZ, own)
+            listening = listening_mask(others, own)
             listens = own.mean() <= 0.2 and listening.mean() >= 0.6
             converses = own.mean() > 0.2 and others.mean() > 0.2
             if active(person.unseen, piece).any() or not (listens if scene == "listening" else converses):
                 continue
             onsets = within(person.nods, piece)[:, 0]
-            rate = nods_per_minute(onsets, listening, FRAME_HZ)
-            answers = phrase_end_counts(onsets, phrase_ends(others, FRAME_HZ), listening, FRAME_HZ)[0]
+            rate = nods_per_minute(onsets, listening)
+            answers = phrase_end_counts(onsets, phrase_ends(others), listening)[0]
             addressed = float((others & (attention_of(piece) == 1)).mean())
             found.append(replace(piece, nods_per_minute=rate, answers=answers, addressed=addressed))
     return found
@@ -296,21 +295,16 @@ def choose(found: Sequence[Stretch], minutes: float, rng: Rng) -> list[Stretch]:
     ranked = sorted(found, key=lambda stretch: stretch.nods_per_minute)
     weights = np.array([stretch.weight for stretch in ranked])
     lengths = np.array([stretch.frames * FRAME_S / 60 for stretch in ranked])
-    chances = _chances(weights, lengths, minutes)
+    low, high = 0.0, 1 / weights.min()  # chances proportional to the weights, none above 1, for the length wanted
+    for _ in range(50):
+        middle = (low + high) / 2
+        low, high = (middle, high) if (np.minimum(1, middle * weights) * lengths).sum() < minutes else (low, middle)
+    chances = np.minimum(1, high * weights)
     if chances.sum() < 1:  # less than one stretch is asked for
         chances = chances / chances.sum()
     spots = np.floor(np.cumsum(chances) + rng.random())
     drawn = np.flatnonzero(np.diff(spots, prepend=0.0) >= 1)
     return [ranked[index] for index in rng.permutation(drawn)]
-
-
-def _chances(weights: Doubles, lengths: Doubles, wanted: float) -> Doubles:
-    """Return chances (K,) proportional to the weights, none above 1, for an expected length as wanted (or all)."""
-    low, high = 0.0, 1 / weights.min()
-    for _ in range(50):
-        middle = (low + high) / 2
-        low, high = (middle, high) if (np.minimum(1, middle * weights) * lengths).sum() < wanted else (low, middle)
-    return np.asarray(np.minimum(1, high * weights), np.float64)
 
 
 # --- one dyad ---------------------------------------------------------------------------------------------------
@@ -326,6 +320,11 @@ def compose_one(stretch: Stretch, material: Material, rng: Rng) -> Dyad:
     if spoken is not None:
         speech, mouth = _laid(person.talk, stretch, spoken, speaking_rng)
         said = speaking.sent(speech, speaking_rng)
+    if person.gaze is None:
+        looks = material.dwell.looks(frames * FRAME_S, rng)
+    else:
+        kept = away(person, stretch.start_s, stretch.end_s, rng)
+        looks = tuple((start - stretch.start_s, end - stretch.start_s, where) for start, end, where in kept)
     score = Score(
         frames=frames,
         nods=within(person.nods, stretch),
@@ -335,10 +334,10 @@ def compose_one(stretch: Stretch, material: Material, rng: Rng) -> Dyad:
         talk=within(person.talk, stretch),
         backchannels=within(person.backchannels, stretch),
         mm_hms=within(person.mm_hms, stretch),
-        gaze=_looks(stretch, material.dwell, rng),
+        gaze=looks,
         shared_laughs=within(person.others_laughs, stretch),
         asked=person.asked[(person.asked > stretch.start_s) & (person.asked < stretch.end_s)] - stretch.start_s,
-        ends=phrase_ends(others, FRAME_HZ),
+        ends=phrase_ends(others),
         mouth=mouth,
     )
     smiling = rng.spawn(1)[0]
@@ -352,7 +351,7 @@ def compose_one(stretch: Stretch, material: Material, rng: Rng) -> Dyad:
         audio=audio,
         speaker=face,
         listener=acted.motion,
-        listening=listening_mask(others, FRAME_HZ, own),
+        listening=listening_mask(others, own),
         agent_audio=said,
         states=states_of(
             own,
@@ -416,16 +415,6 @@ def spans_by(told: Sequence[LabelledSpan], agent: str | None = None) -> Doubles:
     return interval_table((a, b) for a, b, who in told if agent in (None, who))
 
 
-def _looks(stretch: Stretch, dwell: Dwell, rng: Rng) -> LabelledSpans:
-    """Return looks away from the person with the floor, in seconds of the stretch: annotated, or drawn."""
-    if stretch.person.gaze is None:
-        return dwell.looks(stretch.frames * FRAME_S, rng)
-    return tuple(
-        (start - stretch.start_s, end - stretch.start_s, where)
-        for start, end, where in away(stretch.person, stretch.start_s, stretch.end_s, rng)
-    )
-
-
 def active(spans: Doubles, stretch: Stretch) -> Bools:
     """Return frames (N,) whose middle lies in a span."""
     out = np.zeros(stretch.frames, bool)
@@ -473,7 +462,7 @@ def seen(motion: Floats, rng: Rng) -> Floats:
     rests = np.maximum(0, rng.normal(0, 0.05, shapes.shape[1]))
     shapes *= rng.uniform(0.85, 1.1)
     shapes += rests + rng.uniform(0.002, 0.012) * rng.standard_normal(shapes.shape)
-    np.clip(shapes, 0, 1, out=shapes)
+    clip_shapes(out)
     if rng.random() < _LOST:
         for start in rng.uniform(0, frames, rng.poisson(_LOST_A_MINUTE * frames / FRAME_HZ / 60)):
             out[int(start) : int(start + rng.uniform(*_LOST_S) * FRAME_HZ)] = np.nan

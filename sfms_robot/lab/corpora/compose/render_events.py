@@ -26,6 +26,7 @@ from sfms_robot.frames import (
     Doubles,
     Floats,
     ListenerEvent,
+    clip_shapes,
 )
 from sfms_robot.lab.corpora.compose.motions import (
     FADE,
@@ -113,7 +114,7 @@ def act(score: Score, motions: Motions, rng: Rng) -> Acted:
     events += _speak(shapes, score, motions, rng)
     cues = np.concatenate([score.ends, [look.start_s for look in looks]])
     events += _blink(shapes, cues, motions, rng)
-    np.clip(shapes, 0, 1, out=shapes)
+    clip_shapes(motion)
     head = _look(motion, targets, int(rng.integers(2**31)))
     acted = Acted(motion, tuple(sorted(events, key=lambda event: event.start_s)), head)
     return _mirror_image(acted) if rng.random() < 0.5 else acted
@@ -144,7 +145,7 @@ def speaker_motion(
         lay_smile(shapes, start - 0.2, end - start + rng.uniform(0.8, 1.8), rng.uniform(0.5, 0.9), 0.7, motions, rng)
     for start, end, size in smiles.tolist():
         lay_smile(shapes, start, end - start, size, 0.1, motions, rng)
-    np.clip(shapes, 0, 1, out=shapes)
+    clip_shapes(motion)
     seed = int(rng.integers(2**31))
     _look(motion, _speaker_targets(attention, rng), seed)
     return mirrored(motion) if rng.random() < 0.5 else motion

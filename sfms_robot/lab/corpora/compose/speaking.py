@@ -58,7 +58,7 @@ def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: Rng) 
         frames=frames,
         talk=interval_table(runs(active)) * FRAME_S,
         gaze=dwell.looks(frames * FRAME_S, rng),
-        ends=phrase_ends(active, FRAME_HZ),
+        ends=phrase_ends(active),
         mouth=voice.mouth[first + 1 : first + frames + 1],  # a frame shows the face at its end
     )
     acted = act(score, motions, rng)

@@ -131,7 +131,7 @@ def read_voice(file: Path) -> VoiceClip:
     one.
     """
     audio = read_audio(file)
-    active = voice_activity(audio, AUDIO_HZ, _GRAIN / AUDIO_HZ)
+    active = voice_activity(audio, _GRAIN / AUDIO_HZ)
     active = np.convolve(active, [1, 1, 1], "same") > 0  # a grain of margin: soft beginnings and endings
     speech = [(a * _GRAIN, b * _GRAIN) for a, b in runs(active) if b - a >= 5]
     if not speech:
@@ -171,7 +171,7 @@ def _levelled(speech: Floats) -> Floats:
 
 def _lulls(speech: Floats) -> Bools:
     """Return grains (n // 320,) inside pauses that only show once loudness is levelled, less 40 ms at each end."""
-    out = ~voice_activity(speech, AUDIO_HZ, _GRAIN / AUDIO_HZ)
+    out = ~voice_activity(speech, _GRAIN / AUDIO_HZ)
     for start, end in runs(out):
         out[start : start + 2] = out[max(start, end - 2) : end] = False
     return out
@@ -235,7 +235,7 @@ def _pause_spectrum(audio: Floats, active: Bools) -> Doubles:
     if len(grains) < 8 or np.sqrt(np.mean(grains**2)) < 1e-5:
         return np.ones(_GRAIN // 2 + 1)
     spectrum = np.abs(np.fft.rfft(grains * np.hanning(_GRAIN), axis=1)).mean(axis=0)
-    return np.asarray(spectrum / np.sqrt(np.mean(spectrum**2)), np.float64)
+    return np.asarray(spectrum / np.sqrt(np.mean(spectrum**2)))
 
 
 def lay(segments_s: Doubles, frames: int, voice: VoiceClip, rng: Rng) -> tuple[Floats, Floats | None]:

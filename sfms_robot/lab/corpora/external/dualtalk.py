@@ -11,9 +11,8 @@ and HeadRoll of R = Ry Rx Rz in FLAME's axes, which are our three angles, cut at
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -126,16 +125,16 @@ def _found(split: str, voices: Path, folder: Path, kind: Faces) -> Iterator[Foun
         existing(faces[1])
         frames = frames_of(listener, *(kind.shape(file) for file in faces if file.is_file()))
         sounds = voices_of(*(voices / f"{stem}.wav" for stem in stems)) if voiced else []
-        return Clip(name=listener, frames=frames, read=partial(_read, listener, faces, sounds, frames, kind))
+
+        def read() -> Dyad:
+            heard = kind.rows(faces[1], frames, False)
+            speaker = kind.rows(faces[0], frames, True) if faces[0].is_file() else np.full_like(heard, np.nan)
+            pair = list(zip(faces, (speaker, heard), strict=True))
+            return dyad_of(listener, pair, frames, kind.space, FPS, voices=sounds, own=True)
+
+        return Clip(name=listener, frames=frames, read=read)
 
     yield from attempt(listeners, clip)
-
-
-def _read(name: str, faces: Sequence[Path], sounds: Sequence[Path], frames: int, kind: Faces) -> Dyad:
-    listener = kind.rows(faces[1], frames, False)
-    speaker = kind.rows(faces[0], frames, True) if faces[0].is_file() else np.full_like(listener, np.nan)
-    pair = list(zip(faces, (speaker, listener), strict=True))
-    return dyad_of(name, pair, frames, kind.space, FPS, voices=sounds, own=True)
 
 
 LAYOUT: Final = Layout(

@@ -236,7 +236,7 @@ def _read(name: str, pair: Sequence[SeamlessPerson], first: int, frames: int, mi
             raise ClipError("time stamps", person.wav, detail)
     return Dyad(
         name=name, audio=voices[0], speaker=speaker, listener=listener,
-        listening=listening_mask(speaks[0], FPS, speaks[1]), space=SPACE, fps=FPS,
+        listening=listening_mask(speaks[0], speaks[1], FPS), space=SPACE, fps=FPS,
         agent_audio=voices[1],
     )  # fmt: skip
 
@@ -263,7 +263,7 @@ def _motion(person: SeamlessPerson, mirrored: bool) -> Floats:
 
 def _lag_s(active: Bools, voice: Floats) -> float:
     """Return the delay of a voice after its annotation, (N,) at 30 Hz; 0 where it is not known."""
-    heard = voice_activity(voice, AUDIO_HZ, 1 / FPS)
+    heard = voice_activity(voice, 1 / FPS)
     noted = np.pad(active, (0, max(0, len(heard) - len(active))))[: len(heard)]
     reach = int(_LAGS_S * FPS)
     if min(noted.sum(), (~noted).sum(), heard.sum(), (~heard).sum()) < reach or len(noted) < 4 * reach:

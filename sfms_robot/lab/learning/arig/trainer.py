@@ -92,7 +92,7 @@ def arig_job(
     eventful = starts_by_event(corpus, starts, phase.window_frames) if phase.event_windows else {}
     for stage in phase.stages:
         weights_of(stage, starts)
-    fingerprint = corpus.fingerprint()
+    identity = corpus.identity(settings, "training", phase)
     student.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
 
@@ -112,12 +112,7 @@ def arig_job(
         frames_per_step=phase.batch * phase.window_frames,
         phase=phase,
         seed=settings.seed,
-        identity={
-            "seed": settings.seed,
-            "listener": settings.listener.model_dump(mode="json"),
-            "training": phase.identity(),
-            "data": fingerprint,
-        },
+        identity=identity,
     )
 
 
@@ -395,7 +390,12 @@ def _wander(b: int, n: int, channels: int, phase: config.ArigPhase, generator: G
     size = uniform(generator, b, 1, 1) * phase.history_noise
     size = size * (uniform(generator, b, 1, 1) >= COLD)
     jumps = normal(generator, b, n, channels)
-    jumps = _glided(jumps * (uniform(generator, b, n, 1) < JUMPS), generator)
+    jumps = jumps * (uniform(generator, b, n, 1) < JUMPS)
+    # Each is spread evenly over the frames from it on: 1 to `GLIDE`, drawn for each window.
+    frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator, device=jumps.device)
+    total = torch.cat([torch.zeros_like(jumps[:, :1]), jumps.cumsum(1)], dim=1)  # of those before each frame
+    before = (torch.arange(1, n + 1, device=jumps.device) - frames).clamp(min=0)
+    jumps = (total[:, 1:] - total.gather(1, before[..., None].expand(-1, -1, channels))) / frames[..., None]
     fast = normal(generator, b, n, channels)
     return size * decayed(jumps), size * fast
 
@@ -419,16 +419,6 @@ def _left(frames: int) -> Tensor:
     """Return (frames, frames): the share of a jump of one frame (column) that is left in another (row)."""
     frame = torch.arange(frames)
     return ((1 - RETURN) ** (frame[:, None] - frame).double()).tril().float()
-
-
-def _glided(jumps: Tensor, generator: Generator) -> Tensor:
-    """Spread jumps (B, N, C) evenly over the frames from each on: 1 to `GLIDE`, drawn for each window."""
-    b, n = jumps.shape[:2]
-    frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator, device=jumps.device)
-    total = torch.cat([torch.zeros_like(jumps[:, :1]), jumps.cumsum(1)], dim=1)  # of those before each frame
-    before = (torch.arange(1, n + 1, device=jumps.device) - frames).clamp(min=0)
-    ended = total.gather(1, before[..., None].expand(-1, -1, jumps.shape[2]))
-    return (total[:, 1:] - ended) / frames[..., None]
 
 
 def previous_states(states: Tensor, share: float, generator: Generator, count: int) -> Tensor:

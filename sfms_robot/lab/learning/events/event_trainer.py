@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, Ints
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, interval_table
 from sfms_robot.lab.corpora.compose.composed import Stretch, active, spans_by
+from sfms_robot.lab.corpora.compose.motions import Rng
 from sfms_robot.lab.evaluation.intervals import Sums
 from sfms_robot.lab.evaluation.phrase_timing import (
     listening_mask,
@@ -142,13 +143,17 @@ class EventStudent:
     lessons: Mapping[str, Lesson]
 
 
-def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
+def student(person: MeetingPerson, rng: Rng) -> EventStudent:
     """Return the training rows of one person; `rng` draws the events that were not annotated."""
     scene, listening = meeting_scene(person)
     smiles, laughs = sizes.others_smiles(len(listening) * FRAME_S, rng.spawn(1)[0]), person.others_laughs
     # Laughs are seen as `render_events.speaker_motion` lays them.
     seen = np.stack([laughs[:, 0] - 0.2, laughs[:, 1] + 1.1, np.full(len(laughs), np.mean(sizes.LAUGH))], axis=1)
-    scene = replace(scene, smiles=_seen_smiles(np.concatenate([smiles, seen]), len(listening)))
+    shown = np.zeros(len(listening))  # sizes of smiles, from when they are seen until they end
+    for start, end, size in np.concatenate([smiles, seen]).tolist():
+        first = max(0, _seen(start))
+        shown[first : max(first + 1, round(end * FRAME_HZ))] = size
+    scene = replace(scene, smiles=shown)
     spans = spans_of(person, rng, smiles)
     nods = begun_in(spans["nod"], listening)
     heard = heard_in(scene)
@@ -167,15 +172,6 @@ def student(person: MeetingPerson, rng: np.random.Generator) -> EventStudent:
 def _seen(start_s: float) -> int:
     """Return the frame in which a smile from `start_s` on is first seen."""
     return round((start_s + SEEN_S) * FRAME_HZ)
-
-
-def _seen_smiles(smiles: Doubles, frames: int) -> Doubles:
-    """Return (frames,) the sizes of smiles (K, 3) from when they are seen until they end."""
-    out = np.zeros(frames)
-    for start, end, size in smiles.tolist():
-        first = max(0, _seen(start))
-        out[first : max(first + 1, round(end * FRAME_HZ))] = size
-    return out
 
 
 def muted(one: EventStudent) -> EventStudent:
@@ -227,7 +223,7 @@ def by_step(frames: NDArray[_Number], before: float = False) -> NDArray[_Number]
     return known[: len(frames) // STEP_FRAMES]
 
 
-def spans_of(person: MeetingPerson, rng: np.random.Generator, others_smiles: Doubles) -> dict[str, Doubles]:
+def spans_of(person: MeetingPerson, rng: Rng, others_smiles: Doubles) -> dict[str, Doubles]:
     """Return spans (K, 2) of all events of the person; those that were not annotated are drawn.
 
     `others_smiles`: (K, 3) start, end [s], size. One that is returned before it can be seen is returned then.
@@ -251,7 +247,7 @@ def spans_of(person: MeetingPerson, rng: np.random.Generator, others_smiles: Dou
     }
 
 
-def _some(at_s: Doubles, share: float, rng: np.random.Generator) -> Doubles:
+def _some(at_s: Doubles, share: float, rng: Rng) -> Doubles:
     return at_s[rng.random(len(at_s)) < share]
 
 
@@ -262,7 +258,7 @@ def _spans(starts_s: Doubles, length_s: float) -> Doubles:
 
 def lesson(spans_s: Doubles, listening: Bools) -> Lesson:
     """Return the lesson of events (K, 2); none begins inside another."""
-    taken = near(spans_s + [0.0, -FRAME_S], len(listening), FRAME_HZ, 0.0)
+    taken = near(spans_s + [0.0, -FRAME_S], len(listening), 0.0)
     begins = step_at(spans_s[:, 0], STEP_S)
     heard = by_step(listening)
     onsets = np.unique(begins[(begins >= 0) & (begins < len(heard))])
@@ -335,7 +331,7 @@ def meeting_scene(person: MeetingPerson) -> tuple[Scene, Bools]:
 def listening_in(person: MeetingPerson, stretch: Stretch) -> Bools:
     """Return (N,): others spoke in the last 2 s, the participant is silent and in view."""
     others, own, unseen = (active(spans, stretch) for spans in (person.others, person.talk, person.unseen))
-    listening: Bools = listening_mask(others, FRAME_HZ, own) & ~unseen
+    listening: Bools = listening_mask(others, own) & ~unseen
     return listening
 
 
@@ -424,7 +420,7 @@ class Logistic:
 
     def log_odds(self, inputs: Floats) -> Doubles:
         """Return the log-odds (N,) of inputs (N, K)."""
-        return np.asarray(self.intercept + inputs @ self.weights, np.float64)
+        return self.intercept + inputs @ self.weights
 
 
 def fit(inputs: Floats, happens: Doubles, counts: Doubles, ridge: float = 10.0) -> Logistic:
@@ -477,7 +473,7 @@ def count(one: EventStudent, onsets_s: Doubles) -> tuple[Sums, Doubles]:
     spoken_to = listening & (one_speaks == 1) & (own_voice_s >= 1) & (known == 1)
     masks = {"": listening, "addressed_": spoken_to & (looked_at == 1), "bystander_": spoken_to & (looked_at != 1)}
     others = np.asarray(one.scene.speaks[:, 1:].any(axis=1))
-    counts = phrase_end_counts(onsets_s, phrase_ends(others, FRAME_HZ), one.listening, FRAME_HZ)
+    counts = phrase_end_counts(onsets_s, phrase_ends(others), one.listening)
     rates = {f"{who}nods_per_minute": np.array([mask[steps].sum(), minutes(mask)]) for who, mask in masks.items()}
     return {**rates, "phrase_end": np.array(counts)}, np.diff(np.sort(np.cumsum(listening)[steps] * STEP_S))
 

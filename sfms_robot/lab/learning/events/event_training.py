@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import yaml
@@ -17,13 +17,14 @@ from scipy.stats import ks_2samp
 
 from sfms_robot.app.progress import tracked
 from sfms_robot.config import Calmness
-from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, Doubles, Floats
+from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, read_people, split_series
 from sfms_robot.lab.corpora.compose.motions import held, pick
 from sfms_robot.lab.evaluation.intervals import added, mean_interval, rounded
 from sfms_robot.lab.evaluation.meetings import tables
+from sfms_robot.lab.evaluation.robustness import motions_of
 from sfms_robot.lab.evaluation.whole_recordings import decisions, event_spans, heard_in
 from sfms_robot.lab.learning.events import event_trainer
 from sfms_robot.lab.learning.events.event_trainer import (
@@ -41,9 +42,9 @@ from sfms_robot.lab.learning.events.event_trainer import (
 from sfms_robot.listeners.events.evidence import AT, EVIDENCE
 from sfms_robot.listeners.events.model import STEP_S, EventModel, EventTables, Hazard, HazardBank, Shape
 from sfms_robot.signals import event_sizes as sizes
-from sfms_robot.signals.motion_primitives import Motions, read_motions
+from sfms_robot.signals.motion_primitives import Motions
 
-Figures = dict[str, Any]  # for JSON
+Students = Sequence[EventStudent]
 
 # Part of people's nods begin in the 0.2 s after a phrase in which no head can know that it is over: the fit sees them
 # within phrases, and a head's begin 0.12 s after they are decided. So fewer of a head's nods follow a phrase than of
@@ -107,7 +108,7 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> F
         lessons = [one.lessons[kind] for one in taught if kind in one.lessons]
         per_minute = sum(len(one.onsets) for one in lessons) / sum(event_trainer.minutes(one.may) for one in lessons)
         hazards[kind] = hazard(learned, groups[kind], FROM[kind], per_minute)
-    motions = read_motions(data_dir("sim") / "listeners" / "motions.npz")["train"]
+    motions = motions_of("train")
     hazards["gaze_shift"] = look_away_hazard(hazards["gaze_shift"], taught)
     hazards["blink"] = blink_hazard(motions.gaps)
     found = EventTables(hazards={kind: hazards[kind] for kind in EVENT_KINDS}, shapes=shapes(taught, motions))
@@ -143,9 +144,9 @@ def save(file: Path, found: EventTables) -> None:
 def _judged(
     given: Hazard,
     kind: str,
-    taught: Sequence[EventStudent],
-    judged: Sequence[EventStudent],
-    silent: Sequence[EventStudent],
+    taught: Students,
+    judged: Students,
+    silent: Students,
 ) -> Figures:
     """Return what a hazard was learned from, and how it ranks the onsets of other people: mean over them, interval.
 
@@ -160,7 +161,7 @@ def _judged(
     if not judged:
         return found
 
-    def ranked(people: Sequence[EventStudent], *left_out: str) -> Doubles:
+    def ranked(people: Students, *left_out: str) -> Doubles:
         def score(evidence: Doubles) -> Doubles:
             rows = evidence.copy()
             rows[:, [AT[name] for name in left_out]] = np.nan
@@ -183,7 +184,7 @@ def _judged(
     return found
 
 
-def _expected(given: Hazard, kind: str, people: Sequence[EventStudent]) -> float | None:
+def _expected(given: Hazard, kind: str, people: Students) -> float | None:
     """Return the events a minute that a hazard gives in the time of these people in which they may happen."""
     rows = [one.evidence[one.lessons[kind].may] for one in people if kind in one.lessons]
     return rounded(float(expit(_log_odds(given, np.concatenate(rows))).mean()) * 60 / STEP_S)
@@ -199,7 +200,7 @@ def _log_odds(given: Hazard, rows: Doubles) -> Doubles:
     return np.concatenate([bank.log_odds(bank.contributions(part))[:, 0] for part in parts])
 
 
-def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) -> Figures:
+def _rolled_out(model: EventModel, judged: Students, seed: int) -> Figures:
     """Return figures of the people's nods, and of nods alone decided in their places at each rate of `KNOBS`."""
 
     def counted(onsets_s: Iterable[Doubles]) -> tuple[dict[str, float], Doubles]:
@@ -218,7 +219,7 @@ def _rolled_out(model: EventModel, judged: Sequence[EventStudent], seed: int) ->
     return {key: {name: rounded(value) for name, value in figures.items()} for key, figures in found.items()}
 
 
-def _rows(figures: Mapping[str, Any]) -> list[Figures]:
+def _rows(figures: Figures) -> list[Figures]:
     return [
         {
             "kind": kind.replace("_", " "),
@@ -248,7 +249,7 @@ _SHARES: Final = np.linspace(0, 1, STEPS + 1)
 _INNER: Final = np.clip(_SHARES, 0.01, 0.99)  # a tail has no end
 
 
-def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shape]:
+def shapes(students: Students, motions: Motions) -> dict[str, Shape]:
     """Return the shape of every kind, with durations from these people."""
 
     def lasts(spans: str, least_s: float = 0.0, longer_s: float = 0.0) -> tuple[float, ...]:
@@ -300,7 +301,7 @@ def shapes(students: Sequence[EventStudent], motions: Motions) -> dict[str, Shap
 
 def _lengths(spans: Iterable[Doubles]) -> Doubles:
     every = np.concatenate(list(spans))
-    return np.asarray(every[:, 1] - every[:, 0], np.float64)
+    return np.asarray(every[:, 1] - every[:, 0])
 
 
 def _recorded(curves: Sequence[np.typing.NDArray[np.float32]]) -> Doubles:

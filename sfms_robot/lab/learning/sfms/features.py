@@ -225,13 +225,18 @@ def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> T
     Each dyad is placed as a whole where a keyframe has its cost; else stretch by stretch, so that busy seconds may
     borrow from quiet ones of the same stretch.
     """
-    size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
-    penalised = tokenizer.strategy == "penalised"
-    pieces = [
-        piece
-        for dyad in torch.split(motion, list(lengths))
-        for piece in ([dyad] if penalised else torch.split(dyad, _stretches(len(dyad), size, tokenizer.window)))
-    ]
+    pieces: list[Tensor] = []
+    for dyad in torch.split(motion, list(lengths)):
+        size = tokenizer.window * (STRETCH_WINDOWS if tokenizer.strategy == "exact" else 1)
+        if tokenizer.strategy == "penalised":
+            size = len(dyad)
+        whole, rest = divmod(len(dyad), size)
+        sizes = [size] * whole
+        if rest and (rest >= tokenizer.window or not sizes):
+            sizes.append(rest)
+        elif rest:  # no stretch is shorter than a window, unless there is only one
+            sizes[-1] += rest
+        pieces += torch.split(dyad, sizes)
     alike: dict[int, list[int]] = {}  # pieces of one length are placed together
     for index, piece in enumerate(pieces):
         alike.setdefault(len(piece), []).append(index)
@@ -241,17 +246,6 @@ def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> T
             chosen = indices[some : some + TOGETHER]
             masks |= zip(chosen, tokenizer.place(torch.stack([pieces[index] for index in chosen])), strict=True)
     return torch.cat([masks[index] for index in range(len(pieces))])
-
-
-def _stretches(frames: int, size: int, least: int) -> list[int]:
-    """Return lengths that add up to `frames`, none under `least` unless there is only one."""
-    whole, rest = divmod(frames, size)
-    sizes = [size] * whole
-    if rest and (rest >= least or not sizes):
-        sizes.append(rest)
-    elif rest:
-        sizes[-1] += rest
-    return sizes
 
 
 @torch.no_grad()

@@ -79,9 +79,9 @@ def listener_job(
 ) -> Job:
     """Return the job of phase 2, on a model whose tokenizer is trained; move the model to `device`."""
     phase, listener = settings.predictor, settings.listener
-    fingerprint = corpus.fingerprint()
+    identity = corpus.identity(settings, "predictor", phase)
     neutral = neutral_tokens(model, MotionSpace.of(listener), listener.past_frames).to(device)
-    tokenizer_digest = digest_of(model.tokenizer)
+    identity["tokenizer weights"] = digest_of(model.tokenizer)
     model.to(device)
     lessons, unseen = (Lessons(model, each.to(device), phase.tokens) for each in (corpus, held_out))
     starts, motion = lessons.starts, lessons.motion
@@ -126,13 +126,7 @@ def listener_job(
         frames_per_step=phase.batch * listener.window_frames,
         phase=phase,
         seed=settings.seed,
-        identity={
-            "seed": settings.seed,
-            "listener": listener.model_dump(mode="json"),
-            "predictor": phase.identity(),
-            "data": fingerprint,
-            "tokenizer weights": tokenizer_digest,
-        },
+        identity=identity,
     )
 
 

@@ -71,7 +71,7 @@ def tokenizer_job(
 ) -> Job:
     """Return the job of phase 1; move the model to `device`."""
     phase, tokenizer = settings.tokenizer, model.tokenizer
-    fingerprint = corpus.fingerprint()
+    identity = corpus.identity(settings, "tokenizer", phase)
     model.to(device)
     corpus, held_out = corpus.to(device), held_out.to(device)
     motion = standard_motion(model, corpus)
@@ -84,12 +84,7 @@ def tokenizer_job(
         frames_per_step=phase.batch * tokenizer.window,
         phase=phase,
         seed=settings.seed,
-        identity={
-            "seed": settings.seed,
-            "listener": settings.listener.model_dump(mode="json"),
-            "tokenizer": phase.identity(),
-            "data": fingerprint,
-        },
+        identity=identity,
     )
 
 
@@ -120,19 +115,35 @@ def loss_of_steps(
 
     `gain`: of `amplified` windows.
     """
-    if isinstance(tokenizer.score, ScoreNetwork):
-        starts = first_frames(lengths, tokenizer.window)
+    score = tokenizer.score
+    if isinstance(score, ScoreNetwork):
+        starts, adaptive = first_frames(lengths, tokenizer.window), tokenizer.strategy == "adaptive"
 
         def jointly(step: int, generator: Generator, samples: int) -> Tensor:
+            """Return loss (13) with placements sampled by Algorithm 1; the best of `DRAWS` is I* of equation (7)."""
             chosen = starts[torch.randint(len(starts), (samples,), generator=generator)]
             hot, cold = phase.temperature
             temperature = hot * (cold / hot) ** (step / max(1, phase.steps - 1))
             batch = amplified(windows(motion, chosen, tokenizer.window), gain, generator)
-            return learned_loss(tokenizer, batch, temperature, phase, generator)
+            scores, noise = score(batch), noise_of(generator, batch.device)
+            draws = [
+                place_adaptive(scores, temperature, noise)
+                if adaptive
+                else place_learned(scores, tokenizer.keyframes, temperature, noise, tempered=phase.tempered_draws)
+                for _ in range(DRAWS)
+            ]
+            scored = [tokenizer_loss(tokenizer, batch, mask, phase, generator) for mask, _ in draws]
+            best = torch.stack([error for _, error in scored]).argmin(0)  # (B,)
+            target = torch.stack([mask for mask, _ in draws])[best, torch.arange(len(batch), device=batch.device)]
+            loss = torch.stack([each for each, _ in scored]).mean()
+            if adaptive:  # equation (8)
+                wanted = torch.tensor(tokenizer.keyframes, device=batch.device)
+                off = torch.stack([(mask.sum(1) - wanted).abs().mean() for mask, _ in draws])
+                loss = loss + phase.sparsity * off.mean()
+            return loss + phase.mask_loss * torch.stack([masking(relaxed, target) for _, relaxed in draws]).mean()
 
         return jointly
-    draw = batches(tokenizer, motion, lengths, phase.steps * phase.batch)
-    score, most = tokenizer.score, max(tokenizer.keyframes)
+    draw, most = batches(tokenizer, motion, lengths, phase.steps * phase.batch), max(tokenizer.keyframes)
 
     def beside(step: int, generator: Generator, samples: int) -> Tensor:
         batch, mask = draw(samples, generator)
@@ -191,37 +202,6 @@ def tokenizer_loss(
     loss = reconstruction(batch, restored, at_keyframes, mask, tokenizer.member, phase.velocity_loss)
     committed = quantizer.codebook.commitment(latent, mask.detach())
     return loss + phase.commitment * committed, ((restored - batch) ** 2).mean((1, 2)).detach()
-
-
-def learned_loss(
-    tokenizer: Tokenizer,
-    batch: Tensor,
-    temperature: float,
-    phase: config.TokenizerTraining,
-    generator: Generator,
-) -> Tensor:
-    """Return loss (13) with placements sampled by Algorithm 1; the best of `DRAWS` is I* of equation (7)."""
-    assert isinstance(tokenizer.score, ScoreNetwork)
-    scores = tokenizer.score(batch)
-    noise = noise_of(generator, batch.device)
-    k, adaptive = tokenizer.keyframes, tokenizer.strategy == "adaptive"
-    draws = [
-        place_adaptive(scores, temperature, noise)
-        if adaptive
-        else place_learned(scores, k, temperature, noise, tempered=phase.tempered_draws)
-        for _ in range(DRAWS)
-    ]
-    scored = [tokenizer_loss(tokenizer, batch, mask, phase, generator) for mask, _ in draws]
-    best = torch.stack([error for _, error in scored]).argmin(0)  # (B,)
-    masks = torch.stack([mask for mask, _ in draws])
-    target = masks[best, torch.arange(len(batch), device=batch.device)]
-    motion = torch.stack([loss for loss, _ in scored]).mean()
-    if adaptive:  # equation (8)
-        wanted = torch.tensor(k, device=batch.device)
-        motion = (
-            motion + phase.sparsity * torch.stack([(mask.sum(1) - wanted).abs().mean() for mask, _ in draws]).mean()
-        )
-    return motion + phase.mask_loss * torch.stack([masking(relaxed, target) for _, relaxed in draws]).mean()
 
 
 def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
