@@ -30,7 +30,7 @@ from sfms_robot.app.progress import tracked
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, Floats
 from sfms_robot.lab.corpora.clips import UNREADABLE, WIDTHS, Dyad, samples_of
-from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
+from sfms_robot.lab.corpora.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import read_audio
 
 _T = TypeVar("_T")

@@ -15,11 +15,11 @@ from scipy.signal import welch
 
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, YAW_PITCH, Bools, Doubles, Floats, ListenerEvent
 from sfms_robot.lab import Figures
+from sfms_robot.lab.corpora import phrase_timing
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.compose.render_events import Score, act
-from sfms_robot.lab.evaluation import phrase_timing
+from sfms_robot.lab.corpora.phrase_timing import find_gaze_shifts
 from sfms_robot.lab.evaluation.intervals import rounded
-from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts
 from sfms_robot.signals import events
 from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYES_RAD, directions, head_part

@@ -17,8 +17,8 @@ from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Bools, Doubles, 
 from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
+from sfms_robot.lab.corpora.phrase_timing import near
 from sfms_robot.lab.evaluation.listener_tables import spread_clips
-from sfms_robot.lab.evaluation.phrase_timing import near
 from sfms_robot.lab.evaluation.rollout import Rollout, rollouts
 from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.listeners import audio_frontend

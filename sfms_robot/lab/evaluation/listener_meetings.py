@@ -14,12 +14,12 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, Ints, ListenerEvent, SpeakerFrame, changed
+from sfms_robot.lab.corpora import phrase_timing
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active, cast, heard, own_voice, spans_by
 from sfms_robot.lab.corpora.compose.render_events import speaker_motion
 from sfms_robot.lab.corpora.compose.speaking import sent
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, laugh, lay, mouth_over
-from sfms_robot.lab.evaluation import phrase_timing
 from sfms_robot.lab.evaluation.rollout import speaker_frames
 from sfms_robot.signals import events
 from sfms_robot.signals.motion_primitives import Motions

@@ -32,9 +32,9 @@ from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import speaks
 from sfms_robot.lab.corpora.formats import detect, split_names
+from sfms_robot.lab.corpora.phrase_timing import rank_auc
 from sfms_robot.lab.evaluation.detection import middle, movement, nods_of, slow_poses_deg
 from sfms_robot.lab.evaluation.intervals import Chosen, bootstrap, intervals, people_of, rounded
-from sfms_robot.lab.evaluation.phrase_timing import rank_auc
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread, streamable
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread

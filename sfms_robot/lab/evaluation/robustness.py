@@ -47,9 +47,9 @@ from sfms_robot.lab.corpora.clips import Split, split_of_voice
 from sfms_robot.lab.corpora.compose.motions import Rng
 from sfms_robot.lab.corpora.compose.render_events import lay_smile, speaker_motion
 from sfms_robot.lab.corpora.compose.voices import VOICE_FOLDERS, find_voices, mouth_over
+from sfms_robot.lab.corpora.phrase_timing import listening_mask, minutes_of, voice_activity
 from sfms_robot.lab.evaluation.detection import seen
 from sfms_robot.lab.evaluation.intervals import mean_interval, rounded
-from sfms_robot.lab.evaluation.phrase_timing import listening_mask, minutes_of, voice_activity
 from sfms_robot.lab.evaluation.rollout import Rollout, rollout, run_in_processes, speaker_frames
 from sfms_robot.lab.evaluation.whole_recordings import decisions, event_spans, heard_in, scene_in
 from sfms_robot.listeners.events.evidence import AT

@@ -19,13 +19,13 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, Ints, ListenerEvent
+from sfms_robot.lab.corpora import phrase_timing
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson
 from sfms_robot.lab.corpora.compose.composed import Stretch, active
-from sfms_robot.lab.evaluation import phrase_timing
+from sfms_robot.lab.corpora.phrase_timing import find_gaze_shifts, minutes_of
 from sfms_robot.lab.evaluation.detection import Detected, DetectorCalibration, gaze_rad
 from sfms_robot.lab.evaluation.intervals import Figure, Sums, added, distance, median, quotient, ratio
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, ListenerMeeting, frames_before
-from sfms_robot.lab.evaluation.phrase_timing import find_gaze_shifts, minutes_of
 from sfms_robot.lab.evaluation.whole_recordings import event_spans
 from sfms_robot.lab.learning.events.event_trainer import listening_in
 from sfms_robot.signals import phase

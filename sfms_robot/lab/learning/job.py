@@ -13,7 +13,7 @@ A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `lea
         frames_per_step=phase.batch * window,
         phase=phase,                                       # a config.Phase: steps, clipping, precision, patience, ...
         seed=settings.seed,
-        identity={"seed": ..., "listener": ..., "mine": phase.identity(), "data": fingerprint},
+        identity=identity,                                 # `corpus.identity(settings, "mine", phase)`
     )
     outcome = fit(job, out, run)                           # the model now holds its best weights: save them
 

@@ -17,7 +17,7 @@ from sfms_robot.lab.corpora.compose.render_events import Score, act, mirrored, n
 from sfms_robot.lab.corpora.compose.speaking import Dwell, learn_dwell
 from sfms_robot.lab.corpora.compose.voices import find_voices, lay, read_voice, split_voices
 from sfms_robot.lab.corpora.formats import open_dataset
-from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
+from sfms_robot.lab.corpora.phrase_timing import phrase_ends, voice_activity
 from sfms_robot.signals.events import find_blinks, find_nods, find_smiles
 from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYE_PAN_RAD, EYE_TILT_RAD, directions
 from sfms_robot.signals.motion_primitives import KINDS, read_motions

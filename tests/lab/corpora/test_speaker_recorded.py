@@ -11,7 +11,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.frames import AUDIO_HZ, CHANNEL_INDEX, FRAME_HZ, MOTION_DIM, SHAPES
 from sfms_robot.lab.corpora.compose.composed import heard, seen
 from sfms_robot.lab.corpora.compose.voices import find_laughter, laugh, lay, mouth_over, read_voice
-from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
+from sfms_robot.lab.corpora.phrase_timing import phrase_ends, voice_activity
 from sfms_robot.signals.motion_primitives import read_motions
 
 JAW = CHANNEL_INDEX["jawOpen"]

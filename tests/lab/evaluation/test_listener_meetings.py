@@ -8,8 +8,8 @@ from sfms_robot.data import data_dir
 from sfms_robot.frames import FRAME_HZ, FRAME_S, FaceFrame, SpeakerFrame
 from sfms_robot.lab.corpora.compose.ami import phrases
 from sfms_robot.lab.corpora.compose.voices import read_voice
+from sfms_robot.lab.corpora.phrase_timing import voice_activity
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, listener_meeting, part, shifted
-from sfms_robot.lab.evaluation.phrase_timing import voice_activity
 from sfms_robot.signals.motion_primitives import read_motions
 
 

@@ -59,7 +59,7 @@ from sfms_robot.lab.corpora.compose.voices import (
     split_voices,
 )
 from sfms_robot.lab.corpora.conversational_states import states_of
-from sfms_robot.lab.evaluation.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
+from sfms_robot.lab.corpora.phrase_timing import listening_mask, nods_per_minute, phrase_end_counts, phrase_ends
 from sfms_robot.processes import process_pool
 from sfms_robot.signals import event_sizes as sizes
 from sfms_robot.signals.motion_primitives import Motions, read_motions

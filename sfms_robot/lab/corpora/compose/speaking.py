@@ -19,7 +19,7 @@ from sfms_robot.lab.corpora.compose.motions import Rng, pick
 from sfms_robot.lab.corpora.compose.render_events import Score, act
 from sfms_robot.lab.corpora.compose.voices import VoiceClip, room
 from sfms_robot.lab.corpora.conversational_states import states_of_activity
-from sfms_robot.lab.evaluation.phrase_timing import phrase_ends, voice_activity
+from sfms_robot.lab.corpora.phrase_timing import phrase_ends, voice_activity
 from sfms_robot.signals.event_sizes import aside_s
 from sfms_robot.signals.events import runs
 from sfms_robot.signals.motion_primitives import Motions

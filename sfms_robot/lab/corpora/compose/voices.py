@@ -21,7 +21,7 @@ from sfms_robot.frames import AUDIO_HZ, BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SH
 from sfms_robot.lab.corpora.clips import SPLITS, Split, by_split, split_of_voice
 from sfms_robot.lab.corpora.collection import columns
 from sfms_robot.lab.corpora.compose.motions import SHAPE, Rng, pick
-from sfms_robot.lab.evaluation.phrase_timing import voice_activity
+from sfms_robot.lab.corpora.phrase_timing import voice_activity
 from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.events import runs
 from sfms_robot.signals.tracks import read_track, resample

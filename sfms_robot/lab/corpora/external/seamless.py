@@ -41,7 +41,7 @@ from sfms_robot.lab.corpora.collection import (
     npz_shapes,
     track,
 )
-from sfms_robot.lab.evaluation.phrase_timing import listening_mask, voice_activity
+from sfms_robot.lab.corpora.phrase_timing import listening_mask, voice_activity
 from sfms_robot.signals.audio import AudioFile, read_audio
 from sfms_robot.signals.events import runs
 

@@ -23,8 +23,7 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, Bools, Doubles, Floats, Ints
 from sfms_robot.lab.corpora.compose.ami import MeetingPerson, interval_table
 from sfms_robot.lab.corpora.compose.composed import Stretch, active, spans_by
 from sfms_robot.lab.corpora.compose.motions import Rng
-from sfms_robot.lab.evaluation.intervals import Sums
-from sfms_robot.lab.evaluation.phrase_timing import (
+from sfms_robot.lab.corpora.phrase_timing import (
     listening_mask,
     near,
     phrase_end_counts,
@@ -32,6 +31,7 @@ from sfms_robot.lab.evaluation.phrase_timing import (
     rank_auc,
     ratio_of,
 )
+from sfms_robot.lab.evaluation.intervals import Sums
 from sfms_robot.lab.evaluation.whole_recordings import Scene, counts_in, done_at, heard_in, unspoken
 from sfms_robot.listeners.events.evidence import AT, HEARD, MINE, NUMBERS
 from sfms_robot.listeners.events.model import LEAD_FRAMES, LISTENING_S, STEP_FRAMES, STEP_S, Hazard
