@@ -21,7 +21,7 @@ goals outside the limits are part of it, not a failure. Virtual time and seeded 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Final
@@ -149,22 +149,14 @@ class SilencePort(WrappedPort):
 def measure(say: Say) -> BenchResult:
     """Run the whole campaign as a bench."""
     logging.getLogger("sfms_robot").setLevel(logging.CRITICAL)  # thousands of expected faults
-    outcomes = run_campaign(progress=say)
+    outcomes = list[CaseOutcome]()
+    for family, case in product(FAMILIES, CASES):
+        say(f"{family}: {case}")
+        outcomes.append(one(family, case))
     plain = [asdict(each) | {"passed": each.passed} for each in outcomes]
     passed, corrupted = all(each["passed"] for each in plain), corrupted_bytes(outcomes)
     lines = [f"{family}, corrupted bytes: {', '.join(said.values())}" for family, said in corrupted.items()]
     return BenchResult({"passed": passed, "runs": plain, "corrupted_bytes": corrupted}, table(outcomes), lines, passed)
-
-
-def run_campaign(
-    families: Iterable[str] = tuple(FAMILIES), progress: Callable[[str], None] = lambda line: None
-) -> list[CaseOutcome]:
-    """Run every case on every family."""
-    out = []
-    for family, case in product(families, CASES):
-        progress(f"{family}: {case}")
-        out.append(one(family, case))
-    return out
 
 
 def corrupted_bytes(outcomes: Sequence[CaseOutcome]) -> dict[str, dict[str, str]]:

@@ -158,7 +158,7 @@ def state_problems(changes: Sequence[Change], plans_s: Sequence[tuple[float, flo
     ends_s = [at_s for at_s, _, _ in changes[1:]] + [float("inf")]
     over_s = [at_s for at_s, name, _ in changes if name in ("stopping", "stopped", "fault")][:1]
     in_time_s = [came_s for place, (came_s, last_s) in enumerate(plans_s) if not place or came_s <= last_s]
-    for since_s, until_s in pairwise([*in_time_s, *over_s] if plans_s else ()):
+    for since_s, until_s in pairwise([*in_time_s, *over_s]):
         # A late plan shows that the listener is late only when it arrives, so the limit is the sum of both times.
         if until_s - since_s > HUNG_S + LATE_S + _TOLERANCE_S and not any(
             "listener" in why and at_s <= until_s and end_s >= since_s

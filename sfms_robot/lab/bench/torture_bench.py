@@ -288,17 +288,16 @@ def _running(folder: Path, chain: Chain, person: LivePerson, audio: Audio) -> It
     ]  # fmt: skip
     environment = {**package_environment(), **person.environment}
     with held([*MAIN, *words], None, folder, environment) as process:
-        ends_s, status = time.monotonic() + _START_S, dict[str, Any]()
-        while status.get("listener_state", {}).get("state") != "listening" or status["state"] in (
-            "starting",
-            "degraded",
-        ):
+        ends_s, waits = time.monotonic() + _START_S, True
+        while waits:
             if time.monotonic() >= ends_s or process.poll() is not None:
                 lines = (folder / SAID).read_text(encoding="utf-8").strip().splitlines()
                 raise BusError(f"bench live: the run did not begin to listen: {lines[-1:]}")
             time.sleep(_LOOK_S)
             with suppress(OSError):  # the server is not up yet
                 status = _status(port)
+                hears = status.get("listener_state", {}).get("state") == "listening"
+                waits = not hears or status["state"] in ("starting", "degraded")
         yield process, port
 
 
