@@ -19,14 +19,14 @@ place; hazards are finite whatever the input; more of a `Calmness` rate is never
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from sfms_robot.config import Calmness, Model, load
 from sfms_robot.config.base import Finite, NonNegative, Positive
@@ -72,17 +72,15 @@ class Hazard(Model):
     intercept: Finite
     weights: Annotated[dict[str, Finite | Curve], Field(min_length=1)]
 
-    @model_validator(mode="after")
-    def _known(self) -> Hazard:
+    def contradictions(self) -> Iterator[str]:
         for name, weight in self.weights.items():
             if name not in EVIDENCE:
-                raise ValueError(f"weights.{name} is not known evidence ({', '.join(EVIDENCE)})")
+                yield f"weights.{name} is not known evidence ({', '.join(EVIDENCE)})"
             if isinstance(weight, dict) == (name in NUMBERS):
                 wanted = "one number" if name in NUMBERS else "values by knot [s]"
-                raise ValueError(f"weights.{name} needs {wanted}")
+                yield f"weights.{name} needs {wanted}"
             if isinstance(weight, dict) and list(weight) != sorted(weight):
-                raise ValueError(f"weights.{name}: knots have to rise")
-        return self
+                yield f"weights.{name}: knots have to rise"
 
 
 class Shape(Model):
@@ -100,13 +98,10 @@ class Shape(Model):
     habit: Quantiles = (1.0, 1.0)
     swings_hz: Quantiles | None = None
 
-    @model_validator(mode="after")
-    def _rising(self) -> Shape:
-        for name in ("duration_s", "size", "habit", "swings_hz"):
-            values = getattr(self, name)
+    def contradictions(self) -> Iterator[str]:
+        for name, values in self:
             if values is not None and list(values) != sorted(values):
-                raise ValueError(f"{name}: quantiles have to rise")
-        return self
+                yield f"{name}: quantiles have to rise"
 
 
 class EventTables(Model):
@@ -115,15 +110,12 @@ class EventTables(Model):
     hazards: dict[str, Hazard]
     shapes: dict[str, Shape]
 
-    @model_validator(mode="after")
-    def _whole(self) -> EventTables:
-        for section in ("hazards", "shapes"):
-            given = getattr(self, section)
+    def contradictions(self) -> Iterator[str]:
+        for section, given in self:
             for kind in [*given, *EVENT_KINDS]:
                 if kind not in EVENT_KINDS or kind not in given:
                     problem = "is missing" if kind in EVENT_KINDS else "is not a kind of event"
-                    raise ValueError(f"{section}: {kind} {problem} ({', '.join(EVENT_KINDS)})")
-        return self
+                    yield f"{section}: {kind} {problem} ({', '.join(EVENT_KINDS)})"
 
 
 def load_tables(file: Path | None = None) -> EventTables:
