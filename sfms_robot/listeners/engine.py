@@ -28,6 +28,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, Protocol, Self
 
 import numpy as np
+from pydantic import BaseModel
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError
@@ -199,6 +200,23 @@ class GraphFolder:
         return any(graph.rounded for graph in self.graphs.values())
 
 
+class ListedGraph(BaseModel):
+    """A network in the list of graphs: the hash of its file, and its tensors as in `Graph`."""
+
+    sha256: str
+    weights: tuple[str, ...]
+    integers: tuple[str, ...] = ()
+
+
+class GraphList(BaseModel):
+    """The list of graphs: of which settings they are (`digest`), networks by name, and the tensors that they need."""
+
+    format: int
+    settings: str
+    networks: dict[str, ListedGraph]
+    tensors: Shapes
+
+
 def digest(settings: config.ListenerSettings) -> str:
     """Return a hash of all settings that a listener's graphs depend on."""
     known = settings.model_dump(mode="json", exclude=set(OUTSIDE))
@@ -224,33 +242,27 @@ def read_graphs(folder: Path, settings: config.ListenerSettings, integers: bool 
     """
     file, remedy = folder / FOLDER / MANIFEST, f"export them again: sfms-robot export {folder}"
     try:
-        manifest = json.loads(file.read_text(encoding="utf-8"))
-        version, made_for = manifest["format"], manifest["settings"]
-        networks = {
-            name: (each["sha256"], tuple(each["weights"]), tuple(each.get("integers", ())))
-            for name, each in manifest["networks"].items()
-        }
-        wanted = {name: (tuple(shape), real) for name, (shape, real) in manifest["tensors"].items()}
+        listed = GraphList.model_validate_json(file.read_bytes())
     except OSError:
         raise ModelError(f"{file}: no graphs of this listener for engine onnx; {remedy}") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except ValueError:
         raise ModelError(f"{file}: not a list of graphs; {remedy}") from None
-    if version != FORMAT:
-        raise ModelError(f"{file}: graphs of format {version}, this version has {FORMAT}; {remedy}")
-    if made_for != digest(settings):
+    if listed.format != FORMAT:
+        raise ModelError(f"{file}: graphs of format {listed.format}, this version has {FORMAT}; {remedy}")
+    if listed.settings != digest(settings):
         raise ModelError(f"{file}: graphs of another configuration than {folder / 'config.yaml'}; {remedy}")
-    found = {}
+    found, networks = {}, listed.networks
     for name in {network.removesuffix(".int8") for network in networks}:
         chosen = f"{name}.int8" if integers and f"{name}.int8" in networks else name
-        graph, (known, weights, rounded) = folder / FOLDER / f"{chosen}.onnx", networks[chosen]
+        graph, network = folder / FOLDER / f"{chosen}.onnx", networks[chosen]
         try:
             data = graph.read_bytes()
         except OSError:
             raise ModelError(f"{graph}: no such graph; {remedy}") from None
-        if hashlib.sha256(data).hexdigest() != known:
+        if hashlib.sha256(data).hexdigest() != network.sha256:
             raise ModelError(f"{graph}: cut short, or of another model than {MANIFEST} next to it; {remedy}")
-        found[name] = Graph(data, weights, rounded)
-    return GraphFolder(found, wanted)
+        found[name] = Graph(data, network.weights, network.integers)
+    return GraphFolder(found, listed.tensors)
 
 
 # --- onnxruntime ------------------------------------------------------------------------------------------------------
