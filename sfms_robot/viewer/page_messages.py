@@ -154,7 +154,7 @@ def parse_command(data: str) -> tuple[str, dict[str, Any]]:
         raise PacketError(f"a command of more than {LONGEST_COMMAND} characters")
     try:
         given = orjson.loads(data)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise PacketError("JSON that cannot be read") from error
     name = given.pop("type", None) if isinstance(given, dict) else None
     if not isinstance(name, str) or name not in COMMANDS:

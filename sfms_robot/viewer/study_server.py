@@ -11,7 +11,6 @@ Beyond loopback every POST needs the token of the printed address, as `X-Token`.
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Final, Protocol
@@ -26,7 +25,7 @@ from sfms_robot.endpoint import token_admits
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.human import FOLDER as HUMAN
 from sfms_robot.viewer.page_process import Address
-from sfms_robot.viewer.web_server import STATIC, CompressedFiles, WebLoop, application, json_body, listen_at, web_server
+from sfms_robot.viewer.web_server import STATIC, CompressedFiles, application, json_body, listen_at, web_server
 
 MOST_NAME: Final = 64
 
@@ -84,5 +83,4 @@ def serve_study(study: Comparison, address: Address, ready: Callable[[str, int |
     """Serve until interrupted; `ready(url, taken port or None)` once. Raises PortError, KeyboardInterrupt."""
     place = listen_at(address)
     ready(place.url, place.taken)
-    with asyncio.Runner(loop_factory=WebLoop) as runner:
-        runner.run(web_server(study_app(study, place.token), ws="none").serve(sockets=[place.socket]))
+    web_server(study_app(study, place.token), ws="none").run([place.socket])

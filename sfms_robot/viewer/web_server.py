@@ -187,7 +187,7 @@ def web_server(app: ASGIApp, connection: type[H11Protocol] = PromptConnection, *
         uvicorn.Config(
             app,
             http=connection,
-            loop="none",
+            loop=f"{__name__}:WebLoop",
             lifespan="off",
             log_config=None,
             log_level="error",
@@ -224,7 +224,7 @@ class LocalServer:
         self._document: Document = dict
         app = application(routes(lambda: self._document()))
         self._server = web_server(app, BriefConnection, ws="none", headers=[("connection", "close")])
-        self._thread = threading.Thread(target=self._run, name=flag, daemon=True)
+        self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name=flag, daemon=True)
 
     def begin(self, document: Document = dict) -> None:
         """Answer from now on, with this document."""
@@ -238,10 +238,6 @@ class LocalServer:
         if self._thread.ident is not None:
             self._thread.join()
         self._socket.close()
-
-    def _run(self) -> None:
-        with asyncio.Runner(loop_factory=WebLoop) as runner:
-            runner.run(self._server.serve(sockets=[self._socket]))
 
 
 def status_server(wanted: str) -> LocalServer:
