@@ -130,10 +130,7 @@ def _correlations(goals: Doubles, angles: Doubles) -> Doubles | None:
     """Return the correlation (k,) of goals (k, n) and angles (n,); None where one of them hardly moves."""
     if min(goals.std(axis=1).min(), angles.std()) < _MOVES_RAD:
         return None
-    goals = goals - goals.mean(axis=1, keepdims=True)
-    angles = angles - angles.mean()
-    found: Doubles = goals @ angles / np.sqrt((goals * goals).sum(axis=1) * (angles @ angles))
-    return found
+    return np.corrcoef(goals, angles)[-1, :-1]
 
 
 class ReachyDaemon(WebSocketOutput):
