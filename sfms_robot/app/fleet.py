@@ -21,7 +21,6 @@ from __future__ import annotations
 import hmac
 import json
 import logging
-import os
 import secrets
 import threading
 import time
@@ -73,8 +72,8 @@ def fleet_key(file: Path | None) -> bytes:
     file = file or user_dir() / "fleet.key"
     if not file.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
-        with open(os.open(file, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600), "w", encoding="ascii") as made:
-            made.write(secrets.token_hex(32))
+        file.touch(0o600, exist_ok=False)
+        file.write_text(secrets.token_hex(32), encoding="ascii")
     if (mode := file.stat().st_mode & 0o777) & 0o077:
         raise ConfigError(f"--fleet-key {file}: expected mode 600, got {mode:o}: chmod 600 {file}")
     key = file.read_bytes().strip()

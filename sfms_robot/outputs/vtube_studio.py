@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -183,9 +182,8 @@ class VtubeStudio(WebSocketOutput):
         """Write the token into a file that only this user can read."""
         self._file.parent.mkdir(parents=True, exist_ok=True)
         self._file.unlink(missing_ok=True)
-        handle = os.open(self._file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-        with os.fdopen(handle, "w", encoding="ascii") as file:
-            file.write(token)
+        self._file.touch(0o600, exist_ok=False)
+        self._file.write_text(token, encoding="ascii")
 
 
 class VtubeStudioAdd(VtubeStudio):
