@@ -449,15 +449,14 @@ def give_way(nice: int) -> None:
 @contextmanager
 def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
     """Start a pool whose processes compute with one thread each. On leaving, tasks that have not begun are dropped."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(ONE_THREAD)  # a pool starts its processes as tasks come, with the environment of that moment
-    pool = ProcessPoolExecutor(processes, get_context("spawn"))  # torch's threads do not survive a fork
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
+    from sfms_robot.signals.audio import environment  # numpy with it, which few children need
+
+    with environment(ONE_THREAD):  # a pool starts its processes as tasks come, with the environment of that moment
+        pool = ProcessPoolExecutor(processes, get_context("spawn"))  # torch's threads do not survive a fork
+        try:
+            yield pool
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def cores() -> int:

@@ -251,7 +251,7 @@ def check_scale(name: str, samples: NDArray[Any]) -> None:
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables while a library of sound reads them, and restore them. Not for several threads."""
+    """Set environment variables while a library or a process reads them, and restore them. Not for several threads."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
