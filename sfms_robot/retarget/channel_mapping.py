@@ -24,7 +24,7 @@ import numpy as np
 
 from sfms_robot.config import Expression, Head
 from sfms_robot.config.head import drives
-from sfms_robot.errors import ConfigError
+from sfms_robot.errors import InputError
 from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Bools, Doubles, Floats, Indices
 
 Tree = tuple[int, Expression]  # joint, node
@@ -104,15 +104,15 @@ class ChannelMapping:
         self._knobs = self.knobs()
 
     def knobs(self, intensity: Mapping[str, float] | None = None, style: Mapping[str, float] | None = None) -> Knobs:
-        """Return knobs per region over those of the head's file. Raises ConfigError for an unknown region or value."""
+        """Return knobs per region over those of the head's file. Raises InputError for an unknown region or value."""
         values = {"intensity": np.ones(len(self.joints)), "style": np.ones(len(self.joints))}
         for kind, given in (("intensity", intensity or {}), ("style", style or {})):
             for name, value in given.items():
                 if name not in self._regions:
                     choices = ", ".join(self._regions) or "none"
-                    raise ConfigError(f"{kind}: {name!r} is not a region of this head ({choices})")
+                    raise InputError(f"{kind}: {name!r} is not a region of this head ({choices})")
                 if not 0 <= value <= 2:
-                    raise ConfigError(f"{kind} of {name} = {value:g} is not in 0..2")
+                    raise InputError(f"{kind} of {name} = {value:g} is not in 0..2")
             for name, region in self._regions.items():
                 where = [self.joints.index(joint) for joint in region.joints]
                 values[kind][where] = given.get(name, getattr(region, kind))
