@@ -52,8 +52,7 @@ class Identity(Model):
     @property
     def stored(self) -> dict[str, int]:
         """Registers that a measurement of zero and direction declares to be stored in the servo."""
-        known = {"homing_offset": self.homing_offset, "drive_mode": self.drive_mode}
-        return {name: value for name, value in known.items() if value is not None}
+        return self.model_dump(include={"homing_offset", "drive_mode"}, exclude_none=True)
 
     def difference(self, now: Identity) -> str | None:
         """Return the first difference to `now` in words, or None."""
@@ -321,9 +320,9 @@ def provenance(name: str) -> tuple[dict[str, dict[str, tuple[Any, str]]], list[s
             origins |= dict.fromkeys(MEASURED, f"{CALIBRATE} {overlay.measured[joint].date}")
         if joint in layers.fitted and overlay.fit is not None:
             origins |= {"drive": f"{FIT} {overlay.fit.date}"}
-        values = {key: getattr(config, key) for key in SHOWN}
-        if isinstance(drive := values["drive"], Model):
-            values["drive"] = drive.model_dump(mode="json", exclude_defaults=True)
+        values = config.model_dump(include={*SHOWN})
+        if config.drive is not None:
+            values["drive"] = config.drive.model_dump(mode="json", exclude_defaults=True)
         found[joint] = {key: (values[key], origins[key]) for key in SHOWN}
     refused = [f"{joint}: its calibration does not hold: {why}" for joint, why in layers.refused.items()]
     return found, [*refused, *layers.notes]

@@ -147,7 +147,7 @@ def _rows(head: Head, retargeter: HeadRetargeter, clips: Sequence[Doubles]) -> l
         {
             "joint": name,
             "servo": joint.model,
-            **{key: getattr(joint, key) for key in ("bus", "id", "min_deg", "rest_deg", "max_deg")},
+            **joint.model_dump(include={"bus", "id", "min_deg", "rest_deg", "max_deg"}),
             "channels": channels[name],
             **{key: float(column[j]) for key, column in figures.items()},
         }

@@ -43,10 +43,7 @@ def list_maps(more: Iterable[Path] = ()) -> list[dict[str, Any]]:
         low, high = each.firmware.min, each.firmware.max
         rows.append(
             {
-                "model": each.model,
-                "vendor": each.vendor,
-                "family": each.family,
-                "protocol": each.protocol,
+                **each.model_dump(include={"model", "vendor", "family", "protocol"}),
                 "number": each.model_number,
                 "firmware": "any" if (low, high) == (0, 255) else f"{low}.." if high == 255 else f"..{high}",
                 "registers": len(each.registers) or None,
