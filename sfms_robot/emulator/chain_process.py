@@ -33,7 +33,6 @@ from __future__ import annotations
 import json
 import os
 import select
-import shutil
 import signal
 import socket
 import struct
@@ -44,6 +43,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 from sfms_robot.emulator.emulated_wire import EmulatedDevice, EmulatedServo, EmulatedWire
@@ -85,11 +85,10 @@ class PseudoTerminal:
         tty.setraw(self._slave)
         os.set_blocking(self._fd, False)
         self._path = os.ttyname(self._slave)
-        beside = f"{link}.new"
-        if os.path.lexists(beside):
-            os.unlink(beside)
-        os.symlink(self._path, beside)
-        os.replace(beside, link)
+        beside = Path(f"{link}.new")
+        beside.unlink(missing_ok=True)
+        beside.symlink_to(self._path)
+        beside.replace(link)
 
     def watched(self) -> list[Any]:
         """Return what is readable when there is something to `take`."""
@@ -441,13 +440,10 @@ def main() -> None:
         return
     ended, over = socket.socketpair()
     parent.forward(lambda message: None, over.close)
-    folder = tempfile.mkdtemp(prefix="sfms-robot-")
-    try:
+    with tempfile.TemporaryDirectory(prefix="sfms-robot-", ignore_cleanup_errors=True) as folder:
         control, place, plug_in = _bound(description, folder)
         server = Server(wire, description["virtual"], plug_in, control)
         # A servo has a processor of its own: it answers in time whatever else this computer does.
         with closing(server), realtime_priority(wanted=not description["virtual"]) as priority:
             parent.send({"device": server.device, "control": place, "folder": folder, "priority": priority})
             server.run(ended)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
