@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any, Final
@@ -117,7 +117,7 @@ class RunLog:
         self.detached: Mapping[str, str] = {}  # observers that raised
         self.reported: Sequence[str] = ()  # lost parts that log their own loss
         self.states: deque[tuple[float, RunState]] = deque(maxlen=STATES)
-        self.state_s: dict[str, float] = {}
+        self.state_s = defaultdict[str, float](float)
         self._low_rad = np.full(len(joints), np.inf)  # (J,), as the two below
         self._high_rad = -self._low_rad
         self._travel_rad = np.zeros(len(joints))
@@ -152,7 +152,7 @@ class RunLog:
         if self.states:
             since_s, last = self.states[-1]
             before = last.why
-            self.state_s[last.name] = self.state_s.get(last.name, 0.0) + now_s - since_s
+            self.state_s[last.name] += now_s - since_s
             if last.name == "halted" and state.name == "starting":
                 logger.info("halt released")
         self.states.append((now_s, state))

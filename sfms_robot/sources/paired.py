@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -228,7 +229,7 @@ class FrameJudge:
     """
 
     def __init__(self) -> None:
-        self.left_out: dict[str, int] = {}
+        self.left_out = Counter[str]()
         self._attending = AttentionState()
 
     def frame(self, index: int, heard: Floats, seen: Sighting | None, says: Floats | None) -> SpeakerFrame:
@@ -278,7 +279,7 @@ class FrameJudge:
     def _leave_out(self, index: int, what: str, got: str) -> None:
         if what not in self.left_out:
             logger.warning("source: frame %d: %s left out: %s (said once)", index, what, got)
-        self.left_out[what] = self.left_out.get(what, 0) + 1
+        self.left_out[what] += 1
 
 
 def _length_s(voice: Voice | None, sight: Sight | None, agent: Voice | None) -> float | None:
