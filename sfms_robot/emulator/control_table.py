@@ -28,6 +28,7 @@ manual, "Minimum/Maximum angle", "Operating mode", "Running time".
 from __future__ import annotations
 
 from enum import Enum, auto
+from functools import lru_cache
 from typing import Final
 
 from sfms_robot.emulator.plant import MotorCommand
@@ -64,7 +65,7 @@ class ControlTable:
         fields = table.fields
         self._named = {role: field for role in table.roles if (field := table.role(role))} | dict(fields)
         self._ranges = {name: _value_range(field) for name, field in self._named.items()}
-        self._covers: dict[tuple[int, int], tuple[Field, ...]] = {}
+        self.covered = lru_cache(maxsize=_CACHED)(self._covered)
         self._windows = {  # address of an indirect data byte -> address of the word that says what it shows
             field.address: fields[word].address
             for name, field in fields.items()
@@ -84,15 +85,10 @@ class ControlTable:
             low, high = self._ranges[name]
             self.raw[field.address : field.address + field.size] = field.to_bytes(min(max(value, low), high))
 
-    def covered(self, address: int, length: int) -> tuple[Field, ...]:
+    def _covered(self, address: int, length: int) -> tuple[Field, ...]:
         """Return the registers that lie, wholly or in part, in a block."""
-        found = self._covers.get((address, length))
-        if found is None:
-            end = address + length
-            found = tuple(f for f in self.table.fields.values() if f.address < end and f.address + f.size > address)
-            if len(self._covers) < _CACHED:
-                self._covers[address, length] = found
-        return found
+        end = address + length
+        return tuple(f for f in self.table.fields.values() if f.address < end and f.address + f.size > address)
 
     def runs(self, address: int, length: int) -> list[tuple[int, int]]:
         """Return (address, length) of the pieces of memory that a block stands for, seen through its windows."""
