@@ -1,10 +1,10 @@
-"""Paths of the files that ship with the package, and of the user's own."""
+"""Paths of the files that ship with the package, and of the user's own; types of plain data."""
 
 from __future__ import annotations
 
 from importlib.resources import files
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from sfms_robot.errors import ConfigError, did_you_mean
 
@@ -13,6 +13,8 @@ _ARCHIVES: Final = {b"PK\x03\x04": "zip", b"7z\xbc\xaf": "7z", b"Rar!": "rar", b
 
 NO_HEAD: Final = "none"  # the head without servos, which outputs alone show
 
+Names = tuple[str, ...]  # of joints, channels, causes
+Report = dict[str, Any]  # plain data, as --json prints it
 Shipped = Literal["configs", "firmware_maps", "sim"]
 
 

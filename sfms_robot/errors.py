@@ -17,6 +17,7 @@ RobotError                      base; `exit_code` is what the command line retur
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ from pathlib import Path
 from shlex import quote
 from typing import Final
 
+MOST_SAID: Final = 20  # problems of one source, so that nothing floods the log
 INTERRUPTED: Final = 130  # exit code of a command that Ctrl-C or SIGTERM ended, after the safe stop
 NOTE: Final = 25  # level of a log line that informs: shown as a plain line. A WARNING is something to act on.
 
@@ -157,6 +159,23 @@ EXTRA_OF: Final[Mapping[str, str]] = {
     "livekit": "livekit",
     "mcp": "mcp",
 }
+
+
+def first_line(error: BaseException) -> str:
+    """Return the first line of what an error says; the name of its class where it says nothing."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+class Said(set[str]):
+    """Problems of a source of many that were said, whatever their numbers: each once, and `MOST_SAID` at most."""
+
+    def first(self, problem: str) -> bool:
+        """Return whether a problem has not been said, and is to be."""
+        kind = re.sub(r"got .*|[\d.]+", "", problem)
+        new = kind not in self and len(self) < MOST_SAID
+        if new:
+            self.add(kind)
+        return new
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
+Reals = NDArray[np.floating]  # of either precision
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 Indices = NDArray[np.intp]
@@ -53,6 +54,8 @@ CHANNEL_INDEX: Final[Mapping[str, int]] = {name: index for index, name in enumer
 POSE: Final = slice(0, 6)
 SHAPES: Final = slice(6, 58)
 MOTION_DIM: Final = len(CHANNELS)  # 58
+NEUTRAL: Final = np.zeros(MOTION_DIM, np.float32)  # the motion of a neutral face
+NEUTRAL.flags.writeable = False
 YAW_PITCH: Final = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
 BLINKS: Final = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
 SMILE_CORNERS: Final = ("mouthSmileLeft", "mouthSmileRight")  # of the mouth: what tells a smile
@@ -98,7 +101,7 @@ ORDERS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 
 
-def clip_shapes(motion: NDArray[np.floating]) -> None:
+def clip_shapes(motion: Reals) -> None:
     """Limit the blendshapes of motion (..., 58) to 0..1, in place."""
     shapes = motion[..., SHAPES]
     np.clip(shapes, 0.0, 1.0, out=shapes)
@@ -131,7 +134,7 @@ class FaceFrame:
     jaw_rad: Floats | None = None
 
     @classmethod
-    def of(cls, time_s: float, motion: NDArray[np.floating]) -> FaceFrame:
+    def of(cls, time_s: float, motion: Reals) -> FaceFrame:
         """Return the face of one motion row (58,)."""
         row = np.asarray(motion, dtype=np.float32)
         return cls(time_s, row[POSE], row[SHAPES])
@@ -265,3 +268,6 @@ class Reading:
     fault: str | None = None
     extra: Mapping[str, float] = field(default_factory=dict)
     rejoined: bool = False
+
+
+Readings = Mapping[str, Reading]  # by joint

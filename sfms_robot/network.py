@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from sfms_robot.endpoint import is_loopback, port_number
-from sfms_robot.errors import ConfigError, PortError, RobotError, optional
+from sfms_robot.errors import ConfigError, PortError, RobotError, Said, first_line, optional
 
 if TYPE_CHECKING:
     import zenoh
@@ -204,8 +204,7 @@ class Connection:
 
 def _first_line(error: BaseException) -> str:
     """Return the message of zenoh, without the places in its source."""
-    text = (str(error).strip().splitlines() or [type(error).__name__])[0]
-    return text.partition(" at /")[0].rstrip(".")
+    return first_line(error).partition(" at /")[0].rstrip(".")
 
 
 # --- ROS 2 ------------------------------------------------------------------------------------------------------------
@@ -213,7 +212,6 @@ def _first_line(error: BaseException) -> str:
 MOST_DOMAIN: Final = 232
 ROUTER_OF_ROS: Final = "ros2 run rmw_zenoh_cpp rmw_zenohd"
 _QOS: Final = "::,10:,:,:,,"  # all defaults: reliable, volatile, the last ten
-_SAID: Final = 6  # reasons that are logged, each once
 
 
 def ros_domain(text: str, flag: str) -> int:
@@ -273,7 +271,7 @@ class Ros2Node:
         self._gid = b"\x10" + secrets.token_bytes(16)
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._seen: set[tuple[str, str]] = set()  # topic and domain of publishers
-        self._said: set[str] = set()
+        self._said = Said()
         self._kept: list[Any] = []  # what is declared, for as long as the node lives
         config = session_config("call", router)
         config.insert_json5("connect/timeout_ms", "-1" if limit_s is None else str(round(1e3 * limit_s)))
@@ -355,7 +353,5 @@ class Ros2Node:
         self.counts["received"] += 1  # last: a message that is counted has been taken, or refused
 
     def _say(self, topic: str, reason: str) -> None:
-        key = topic + re.sub(r"[\d.]+", "", reason)
-        if key not in self._said and len(self._said) < _SAID:
-            self._said.add(key)
+        if self._said.first(topic + reason):
             log.warning("%s: %s: left out: %s (said once)", self.name, topic, reason)

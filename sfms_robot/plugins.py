@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.data import find
-from sfms_robot.errors import ConfigError, RobotError
+from sfms_robot.errors import ConfigError, RobotError, first_line
 
 if TYPE_CHECKING:  # numpy, which a look at a name does not need
     from sfms_robot.ports import Listener
@@ -51,8 +51,7 @@ def plug_in(entry: EntryPoint, *arguments: Any, **more: Any) -> Any:
         if entry.value.startswith("sfms_robot.") or (arguments and isinstance(error, RobotError)):
             raise
         log.info("traceback of plug-in %s", entry.name, exc_info=True)
-        text = (str(error).splitlines() or [""])[0]
-        raise plugin_error(entry, f"{type(error).__name__}: {text}") from error
+        raise plugin_error(entry, f"{type(error).__name__}: {first_line(error)}") from error
 
 
 def plugin_error(entry: EntryPoint, problem: str) -> ConfigError:

@@ -12,7 +12,8 @@ from typing import Any, Final, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from sfms_robot.frames import Doubles, Floats, Ints, ListenerEvent, Plan, Reading, Sighting, SpeakerFrame
+from sfms_robot.data import Names
+from sfms_robot.frames import Doubles, Floats, Ints, ListenerEvent, Plan, Readings, Sighting, SpeakerFrame
 
 StopPolicy = Literal["release", "hold"]  # torque off, or torque kept on, once the rest pose is reached
 Facts = Mapping[str, Any]  # figures and states for a report, by name
@@ -83,7 +84,7 @@ class Source(Protocol):
     duration_s: float | None = None
     latency_s: float = 0.0
     outlets: Sequence[Outlet] = ()
-    missing: tuple[str, ...] = ()
+    missing: Names = ()
 
     def start(self, origin_s: float) -> None:
         """Set loop time 0, the first tick after torque came on, to `origin_s` of `time.monotonic`; drop earlier data.
@@ -199,7 +200,7 @@ class Bus(Protocol):
         is not finite, or a goal to be sent that is not in the range in force.
         """
 
-    def poll(self, now_s: float) -> Mapping[str, Reading]:
+    def poll(self, now_s: float) -> Readings:
         """Return the freshest reading of every joint, and recover servos in trouble.
 
         Blocks within the bus's time budget, also after losses on the wire: silence of any number of servos costs one
@@ -282,9 +283,9 @@ class Tick:
     time_s: float
     motion: Floats
     goals_rad: Doubles
-    readings: Mapping[str, Reading]
+    readings: Readings
     state: str = "starting"
-    why: tuple[str, ...] = ()
+    why: Names = ()
     written_s: float | None = None
     origin_s: float | None = None
     busy: str | None = None
@@ -316,7 +317,7 @@ class OutputFrame:
     state: str = "starting"
     events: tuple[ListenerEvent, ...] = ()
     goals_rad: Doubles = field(default_factory=lambda: np.zeros(0))
-    joints: tuple[str, ...] = ()
+    joints: Names = ()
 
 
 class Output(Protocol):

@@ -38,7 +38,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from pathlib import Path
@@ -106,8 +106,7 @@ class Child:
         self._writer = PipeWriter(self.process.stdin, kept, name)
         for message in first:
             self.send(message)
-        self.reader = threading.Thread(target=self._read, args=(self.process.stdout,), name=name, daemon=True)
-        self.reader.start()
+        self.reader = start_thread(self._read, name, self.process.stdout)
 
     def send(self, message: Any) -> None:
         """Send a message after all that were sent before, and before those that were offered."""
@@ -199,7 +198,7 @@ class PipeWriter:
         self._closing = False
         if _NON_BLOCKING:
             os.set_blocking(pipe.fileno(), False)
-        threading.Thread(target=self._wait_for_room, name=name, daemon=True).start()
+        start_thread(self._wait_for_room, name)
 
     def send(self, message: bytes) -> None:
         """Write a message after all that were sent before, and before those that were offered."""
@@ -432,12 +431,19 @@ class ParentPipe:
                 take(message)
             end()
 
-        threading.Thread(target=read, daemon=True).start()
+        start_thread(read, "parent")
 
     def send(self, message: Any) -> None:
         """Send a message. Blocks while the pipe is full."""
         pickle.dump(message, self.outgoing, protocol=5)
         self.outgoing.flush()
+
+
+def start_thread(work: Callable[..., object], name: str, *arguments: Any) -> threading.Thread:
+    """Start a thread that does not keep the program alive."""
+    thread = threading.Thread(target=work, args=arguments, name=name, daemon=True)
+    thread.start()
+    return thread
 
 
 def give_way(nice: int) -> None:
@@ -451,12 +457,10 @@ def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
     """Start a pool whose processes compute with one thread each. On leaving, tasks that have not begun are dropped."""
     from sfms_robot.signals.audio import environment  # numpy with it, which few children need
 
-    with environment(ONE_THREAD):  # a pool starts its processes as tasks come, with the environment of that moment
+    with environment(ONE_THREAD), ExitStack() as stack:  # a pool starts its processes as tasks come, with that of then
         pool = ProcessPoolExecutor(processes, get_context("spawn"))  # torch's threads do not survive a fork
-        try:
-            yield pool
-        finally:
-            pool.shutdown(cancel_futures=True)
+        stack.callback(pool.shutdown, cancel_futures=True)
+        yield pool
 
 
 def cores() -> int:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import cast, get_args
 
-from sfms_robot.app.options import Report
 from sfms_robot.app.output_paths import made_folder
 from sfms_robot.app.progress import bar
 from sfms_robot.config import load_head, load_listener
-from sfms_robot.data import data_dir, find, head_names, listener_names, speaker_names
+from sfms_robot.data import Report, data_dir, find, head_names, listener_names, speaker_names
 from sfms_robot.errors import ConfigError, RobotError, optional
 from sfms_robot.listeners.checkpoint import WEIGHTS, Bits, read_weights, write_tensors
 from sfms_robot.outputs.registry import DESCRIPTIONS, output_kinds

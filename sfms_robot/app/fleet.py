@@ -33,11 +33,12 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 
 from sfms_robot.app.listen.knobs import RunControls
 from sfms_robot.config.base import Finite, one_line
-from sfms_robot.data import user_dir
+from sfms_robot.data import Names, user_dir
 from sfms_robot.endpoint import LOOPBACK
-from sfms_robot.errors import ConfigError, PortError, RobotError
+from sfms_robot.errors import ConfigError, PortError, RobotError, first_line
 from sfms_robot.network import AWAY_S, Connection, Router, check_name, session_config
 from sfms_robot.ports import Facts, Observer, Tick
+from sfms_robot.processes import start_thread
 
 if TYPE_CHECKING:
     import zenoh
@@ -161,7 +162,7 @@ class FleetControls:
         except ValidationError as error:
             return {"error": " ".join(one_line(error.errors()[0]).split())}
         except RobotError as error:
-            return {"error": str(error).splitlines()[0]}
+            return {"error": first_line(error)}
         return {"done": command.command}
 
     def _check_proof(self, command: _Keyed, key: bytes) -> None:
@@ -191,9 +192,8 @@ class FleetHead(Observer):
         self._connection = Connection(session_config("call", router))
         self._news, self._over = threading.Event(), False
         self._malformed = 0
-        self._state: tuple[str, tuple[str, ...]] = ("", ())
-        self._thread = threading.Thread(target=self._work, name="fleet", daemon=True)
-        self._thread.start()
+        self._state: tuple[str, Names] = ("", ())
+        self._thread = start_thread(self._work, "fleet")
 
     def tick(self, seen: Tick) -> None:
         """Send the state soon where it has changed."""

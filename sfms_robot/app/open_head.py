@@ -19,19 +19,18 @@ from shlex import quote
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfms_robot.app.options import SIM, HeadOptions, Report, RunOptions
+from sfms_robot.app.options import SIM, HeadOptions, RunOptions
 from sfms_robot.app.servo.serial_line import Wire
 from sfms_robot.app.wiring import Opened, calibration_of, devices, open_wires, port_of
 from sfms_robot.config import FirmwareMap, Head, Joint, load_firmware_map, load_head
 from sfms_robot.config.check import register_problems
 from sfms_robot.config.head import held_back
 from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
-from sfms_robot.data import NO_HEAD
+from sfms_robot.data import NO_HEAD, Report
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import ConfigError, ServoError
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import Bools, Doubles
 from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
@@ -65,7 +64,7 @@ class Motion:
     audit: CommandAudit
     leads_s: Doubles
     rest_rad: Doubles
-    holds: NDArray[np.bool_]
+    holds: Bools
     heat: HeatGuard
 
 

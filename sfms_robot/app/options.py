@@ -12,9 +12,9 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-from sfms_robot.data import NO_HEAD, head_file
+from sfms_robot.data import NO_HEAD, Names, head_file
 from sfms_robot.errors import ConfigError
 from sfms_robot.network import Router
 from sfms_robot.plugins import listener_folder
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from sfms_robot.runtime.recorder import RecordFormat
     from sfms_robot.viewer.page_process import PageProcess
 
-Names = tuple[str, ...]
-Report = dict[str, Any]  # plain data, as --json prints it
 
 SIM: Final = "sim"  # the port of emulated servos
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")

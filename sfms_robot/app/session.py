@@ -29,7 +29,8 @@ from sfms_robot.app.listen.report import (
     run_report,
 )
 from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
-from sfms_robot.app.options import Report, RunOptions, begin_listening
+from sfms_robot.app.options import RunOptions, begin_listening
+from sfms_robot.data import Report
 from sfms_robot.endpoint import leads_here
 from sfms_robot.errors import NOTE, ConfigError, RobotError, TorqueError
 from sfms_robot.listeners.process import ListenerProcess

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from typer import Argument, Exit, Option, Typer
 
 from sfms_robot.cli.show import JSON, Later, Result, aside, cell, print_rows, say, show, with_shared_options
-from sfms_robot.data import listener_names
+from sfms_robot.data import Report, listener_names
 from sfms_robot.errors import INTERRUPTED, ConfigError
 
 if TYPE_CHECKING:
@@ -92,9 +92,7 @@ def listener(flags: PhaseFlags) -> None:
     _train(train_runs.train_listener, flags, {})
 
 
-def _train(
-    work: Callable[[train_runs.TrainOptions], dict[str, Any]], flags: PhaseFlags, changes: Mapping[str, str]
-) -> None:
+def _train(work: Callable[[train_runs.TrainOptions], Report], flags: PhaseFlags, changes: Mapping[str, str]) -> None:
     """Run a phase of training, or one step of every phase, and print its figures."""
     if flags.dry_run:
         from sfms_robot.config import load_training
@@ -127,7 +125,7 @@ def _train(
     show(figures, flags.json)
 
 
-def interruptible(train: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def interruptible(train: Callable[[], Report]) -> Report:
     """Return the figures of a training; Ctrl-C ends the process, and prints how to continue if it can be continued."""
     try:
         return train()

@@ -11,7 +11,7 @@ because readers do not agree on it.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Self, TypeVar, get_args
 
@@ -47,6 +47,9 @@ def _printable(text: str) -> str:
 
 
 PRINTABLE: Final = AfterValidator(_printable)
+
+
+Problems = Iterator[str]  # one line each
 
 
 class Model(BaseModel):

@@ -12,7 +12,7 @@ from typing import Final
 
 from pydantic import ValidationError
 
-from sfms_robot.config.base import one_line
+from sfms_robot.config.base import Problems, one_line
 from sfms_robot.config.firmware import FirmwareMap, load_firmware_map
 from sfms_robot.config.head import Head, load_head
 from sfms_robot.config.joint import BUS_FAMILIES, Safety
@@ -41,7 +41,7 @@ def check_head(name: str) -> list[str]:
     return [f"{file}: {line}" for line in dict.fromkeys(found)]
 
 
-def _servos(head: Head) -> Iterator[str]:
+def _servos(head: Head) -> Problems:
     """Yield the servos without a firmware map or of another family than their bus, and what a run must not write."""
     for name, joint in head.joints.items():
         try:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import Any, Final
 
+from sfms_robot.config.base import Problems
 from sfms_robot.config.joint import Expression
 from sfms_robot.config.kinematics import SerialNeck
 from sfms_robot.config.wire_time import BITS, FRAMINGS
@@ -22,7 +23,7 @@ def problems(head: Any) -> list[str]:
     return [*_wiring(head), *_rates(head), *_drives(head), *_parts(head), *_neck(head), *_description(head)]
 
 
-def _wiring(head: Any) -> Iterator[str]:
+def _wiring(head: Any) -> Problems:
     """Yield the joints that are on no bus, of no limit class, or on another's id."""
     seen: dict[tuple[str, int], str] = {}
     for name, joint in head.joints.items():
@@ -46,7 +47,7 @@ def highest_rate_hz(family: str, baud: int, joints: int) -> float:
     return min(HIGHEST_RATE_HZ, max(1.0, float(baud // (BITS * framing.goals(joints)))))
 
 
-def _rates(head: Any) -> Iterator[str]:
+def _rates(head: Any) -> Problems:
     """Yield the buses whose packets, or whose wire at `rate_hz`, cannot carry the goals of their joints."""
     for name, bus in head.buses.items():
         count = len(head.on_bus(name))
@@ -60,7 +61,7 @@ def _rates(head: Any) -> Iterator[str]:
             yield f"buses.{name}.rate_hz = {bus.rate_hz:g} {problem}"
 
 
-def _drives(head: Any) -> Iterator[str]:
+def _drives(head: Any) -> Problems:
     """Yield unknown names, wrong mirrors, circles, and drives that are too large."""
     for name in head.expressions:
         if name in CHANNEL_INDEX:
@@ -100,7 +101,7 @@ def _size(tree: Expression, sizes: Mapping[str | None, int]) -> int:
     return sum(1 + sizes.get(node.use, 0) for node in tree.nodes())
 
 
-def _parts(head: Any) -> Iterator[str]:
+def _parts(head: Any) -> Problems:
     """Yield the joints of folds, couplings and regions that are unknown or claimed twice."""
     for index, fold in enumerate(head.folds):
         if fold.into not in head.joints:
@@ -122,7 +123,7 @@ def _parts(head: Any) -> Iterator[str]:
                 yield f"regions.{name}.joints: {joint!r} is already in region {owner[joint]}"
 
 
-def _neck(head: Any) -> Iterator[str]:
+def _neck(head: Any) -> Problems:
     """Yield the neck's joints that are unknown, have a drive or a fold, or do not rest where the neck is at home."""
     if (neck := head.kinematics) is None:
         return
@@ -143,7 +144,7 @@ def _neck(head: Any) -> Iterator[str]:
             yield f"joints.{name}.rest_deg = {joint.rest_deg:g}: the neck rests at 0; shift zero_ticks instead"
 
 
-def _description(head: Any) -> Iterator[str]:
+def _description(head: Any) -> Problems:
     """Yield the joints of the URDF section that the head lacks, and joints of the URDF that two of ours would move."""
     if head.urdf is None:
         return

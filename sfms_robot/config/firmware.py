@@ -8,14 +8,13 @@ has one file per layout (`xl330-m288.yaml`, `xl330-m288_fw52.yaml`): `variant` p
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field, PositiveInt, computed_field
 
-from sfms_robot.config.base import Finite, Model, Name, Positive, load
+from sfms_robot.config.base import Finite, Model, Name, Positive, Problems, load
 from sfms_robot.data import data_dir, user_dir
 from sfms_robot.errors import ConfigError
 
@@ -82,7 +81,7 @@ class Register(Model):
         """The address after its last byte."""
         return self.address + self.size
 
-    def problems(self) -> Iterator[str]:
+    def problems(self) -> Problems:
         """Yield each impossible value of this row as `key = value problem`."""
         if self.signed.startswith("sign_bit_") and int(self.signed.removeprefix("sign_bit_")) >= 8 * self.size:
             yield f"signed = {self.signed!r} does not fit {self.size} byte(s)"
@@ -106,7 +105,7 @@ class FirmwareRange(Model):
     min: int = Field(default=0, ge=0, le=255)
     max: int = Field(default=255, ge=0, le=255)
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if self.min > self.max:
             yield f"min = {self.min} is above max = {self.max}"
 
@@ -152,11 +151,11 @@ class FirmwareMap(Model):
     roles: dict[Role, Name | None] = {}  # where the register's name is not the role's own
     registers: dict[Name, Register] = {}
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if problems := [*self._shape(), *self._layout(), *self._references()]:
             yield "; ".join(problems)
 
-    def _shape(self) -> Iterator[str]:
+    def _shape(self) -> Problems:
         """Yield keys of a board in a servo's map, and the reverse."""
         allowed = {"dynamixel": (1, 2), "feetech": (1,)}.get(self.family, (None,))
         if self.protocol not in allowed:
@@ -173,7 +172,7 @@ class FirmwareMap(Model):
         if bool(self.registers) == board:
             yield f"registers: a {self.family} board has none" if board else "registers is empty"
 
-    def _layout(self) -> Iterator[str]:
+    def _layout(self) -> Problems:
         """Yield registers that overlap, leave the address space, or cannot hold their values."""
         end, last = 0, ""
         wide = any(register.size == 4 for register in self.registers.values())
@@ -189,7 +188,7 @@ class FirmwareMap(Model):
             yield from (f"registers.{name}.{problem}" for problem in register.problems())
             end, last = max(end, register.end), name
 
-    def _references(self) -> Iterator[str]:
+    def _references(self) -> Problems:
         for role, name in self.roles.items():
             if name is not None and name not in self.registers:
                 yield f"roles.{role} = {name!r} is not a register of this map"

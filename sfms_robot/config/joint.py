@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, PositiveInt, StrictInt, ValidationInfo, WithJsonSchema, model_validator
 
-from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Problems
 from sfms_robot.config.firmware import model_name
 from sfms_robot.errors import did_you_mean, not_one_of
 from sfms_robot.frames import CHANNEL_INDEX
@@ -78,7 +78,7 @@ class Expression(Model):
             return {"channel" if value in CHANNEL_INDEX else "use": value}
         return value
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         kinds = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(kinds) != 1:
             yield f"needs exactly one of {', '.join(KINDS)}; has {', '.join(kinds) or 'none'}"
@@ -124,7 +124,7 @@ class Coupling(Model):
     at_least: float = Field(le=0, ge=-1000)  # at rest the sum is 0: rest has to be allowed
     moving: tuple[Name, ...] = Field(min_length=1)
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         for name in self.moving:
             if not self.keep.get(name):
                 yield f"moving: {name!r} has no weight under keep ({', '.join(self.keep)})"
@@ -191,7 +191,7 @@ class Safety(Model):
     registers: dict[Name, StrictInt] = {}
     stored: dict[Name, StrictInt] = {}
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if self.hot_C <= self.warm_C:
             yield f"hot_C: {self.hot_C:g} is not above warm_C ({self.warm_C:g})"
 
@@ -250,7 +250,7 @@ class Joint(Model):
     safety: Safety | None = None  # over that of the head
     note: str = ""
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if self.min_deg >= self.max_deg:
             yield f"min_deg {self.min_deg:g} is not below max_deg {self.max_deg:g}: limits reversed"
         if not self.min_deg <= self.rest_deg <= self.max_deg:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import chain
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Discriminator, Field, Tag
 
-from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Problems, Share
+from sfms_robot.data import Names
 
 AxisName = Literal["roll", "pitch", "yaw"]
 Triple = tuple[Finite, Finite, Finite]
@@ -28,7 +28,7 @@ class Split(Model):
     lower_share: Share | None = None
     crossover_hz: Positive | None = None
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if (self.lower_share is None) == (self.crossover_hz is None):
             yield "needs exactly one of lower_share, crossover_hz"
 
@@ -44,7 +44,7 @@ class Differential(Model):
     pitch_gain: Finite = 1.0
     roll_gain: Finite = 1.0
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         for key in ("pitch_gain", "roll_gain"):
             if getattr(self, key) == 0:
                 yield f"{key} is 0: no servo angle would move that axis"
@@ -64,7 +64,7 @@ class SerialNeck(Model):
     axes: dict[AxisName, AxisJoints] = {}
     differential: Differential | None = None
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if len(set(self.order)) != len(self.order):
             yield f"order {list(self.order)} has an axis twice; two joints of one axis are a split"
         geared: tuple[AxisName, ...] = ("pitch", "roll") if self.differential else ()
@@ -76,13 +76,13 @@ class SerialNeck(Model):
                 yield f"axis {axis!r} has a joint but is not in order ({', '.join(self.order)})"
         yield from _distinct(self.joints())
 
-    def joints(self) -> tuple[str, ...]:
+    def joints(self) -> Names:
         """Return every joint that the neck moves, from the base up; a differential has its two at its first axis."""
         geared = next((axis for axis in self.order if axis not in self.axes), None)
         turning = [self.joints_of(axis) for axis in self.order if axis in self.axes or axis == geared]
         return tuple(chain.from_iterable(turning))
 
-    def joints_of(self, axis: str) -> tuple[str, ...]:
+    def joints_of(self, axis: str) -> Names:
         """Return the joints that turn about one axis; none about one that the neck does not have."""
         pair = self.differential
         place = next((place for name, place in self.axes.items() if name == axis), None)
@@ -129,18 +129,18 @@ class StewartPlatform(Model):
     limits: PoseLimits = PoseLimits()
     body_yaw: BodyYaw | None = None
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         yield from _distinct(self.joints())
         for number, leg in enumerate(self.legs):
             turn = np.array(leg.servo_from_body)[:, :3]
             if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-6:
                 yield f"legs.{number}.servo_from_body is not a rotation and a shift"
 
-    def joints(self) -> tuple[str, ...]:
+    def joints(self) -> Names:
         """Return the joint of body yaw, if any, then those of the legs in order."""
         return self.joints_of("yaw")
 
-    def joints_of(self, axis: str) -> tuple[str, ...]:
+    def joints_of(self, axis: str) -> Names:
         """Return the joints that move the head about or along one axis: all legs, and for yaw the body's first."""
         body = (self.body_yaw.joint,) if self.body_yaw and axis == "yaw" else ()
         return (*body, *(leg.joint for leg in self.legs))
@@ -149,7 +149,7 @@ class StewartPlatform(Model):
 Kinematics = Annotated[SerialNeck | StewartPlatform, Field(discriminator="kind")]
 
 
-def _distinct(joints: tuple[str, ...]) -> Iterator[str]:
+def _distinct(joints: Names) -> Problems:
     for joint in joints:
         if joints.count(joint) > 1:
             yield f"joint {joint!r} is used twice"

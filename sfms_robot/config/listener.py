@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import BeforeValidator, Field, NonNegativeInt, model_validator
 
-from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Share, parse, read
+from sfms_robot.config.base import Finite, Model, Name, NonNegative, Positive, Problems, Share, parse, read
 from sfms_robot.config.hop import default_hop
+from sfms_robot.data import Names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, PITCH_CHANNEL, SMILE_CORNERS, SPACE_CHANNELS
 
@@ -66,7 +67,7 @@ class ChannelGroup(Model):
         transition_bias: on the logit of class 0, more for fewer keyframes.
     """
 
-    channels: tuple[str, ...] = Field(min_length=1)
+    channels: Names = Field(min_length=1)
     levels: Levels
     keyframes: Count | None = None
     keyframe_cost: Positive | None = None
@@ -92,7 +93,7 @@ class SmileCourse(Model):
     rise: tuple[Share, ...] = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0)
     fall: tuple[Share, ...] = (0.0, 0.125, 0.25, 0.375, 0.5, 0.625, 1.0)
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         for key, shares, at in (("rise", self.rise, self.RISE_S), ("fall", self.fall, self.FALL_S)):
             if len(shares) != len(at):
                 yield f"{key}: {len(shares)} shares, {len(at)} are needed"
@@ -131,7 +132,7 @@ class Sampling(Model):
     smile: SmileCourse | None = None
 
 
-def uneven_heads(heads: int, **widths: int) -> Iterator[str]:
+def uneven_heads(heads: int, **widths: int) -> Problems:
     """Yield the problem of each width, by its key, that cannot be cut into `heads` heads of even width."""
     for key, width in widths.items():
         if width % (2 * heads):
@@ -146,7 +147,7 @@ class Scores(Model):
     heads: Count = 4
     sweeps: NonNegativeInt = 2
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         yield from uneven_heads(self.heads, width=self.width)
 
 
@@ -173,15 +174,15 @@ class ListenerSettings(Model):
     sway: bool = False
 
     @property
-    def channels(self) -> tuple[str, ...]:
+    def channels(self) -> Names:
         return SPACE_CHANNELS[self.motion_space]
 
     @property
-    def drawn_channels(self) -> tuple[str, ...]:
+    def drawn_channels(self) -> Names:
         """Channels that the model draws; the others stay 0."""
         return tuple(name for name in self.channels if not (self.events and name in GAZE_CHANNELS))
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if self.neutral is not None and len(self.neutral) != len(self.channels):
             yield f"neutral: {len(self.neutral)} numbers, {self.motion_space} has {len(self.channels)}"
         if self.flame_matrix is not None and self.motion_space != "deca56":
@@ -261,7 +262,7 @@ class Sfms(ListenerSettings):
         rest = {key: wanted[key] for key in ("levels", "keyframes")}
         return raw | {"groups": {name: {"channels": members, **rest} for name, members in sets.items()}}
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         yield from super().contradictions()
         owner: dict[str, str] = {}
         for name, group in self.groups.items():
@@ -359,7 +360,7 @@ class Diffusion(Model):
         fits = (value for prefix, value in self.temperatures.items() if channel.startswith(prefix))
         return next(fits, self.temperature)
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if self.steps > self.train_steps:
             yield f"steps {self.steps} is above train_steps {self.train_steps}"
 
@@ -407,7 +408,7 @@ class Arig(ListenerSettings):
     diffusion: Diffusion = Diffusion()
     precision: Literal["auto", "fp32", "int8"] = "auto"
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         yield from super().contradictions()
         yield from uneven_heads(self.heads, width=self.width)
         if self.discrete and self.draws != "motion":
@@ -419,7 +420,7 @@ class Arig(ListenerSettings):
                 yield f"diffusion.temperatures.{prefix}: no channel of {self.motion_space} begins so"
 
     @property
-    def states(self) -> tuple[str, ...]:
+    def states(self) -> Names:
         """Conversational states that the model distinguishes."""
         return EVENT_STATES if self.events else STATES
 

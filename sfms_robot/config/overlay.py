@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import date
@@ -24,13 +24,14 @@ from typing import Annotated, Any, Final, Literal
 import yaml
 from pydantic import Field
 
-from sfms_robot.config.base import Model, Name, load, parse, read, with_number
+from sfms_robot.config.base import Model, Name, Problems, load, parse, read, with_number
 from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
 from sfms_robot.config.head import NOT_SHARED, Head, load_head
 from sfms_robot.config.joint import Expression, Joint, Safety
 from sfms_robot.data import data_dir, head_file, user_dir
 from sfms_robot.errors import ConfigError
+from sfms_robot.ports import Facts
 
 CALIBRATE: Final = "calibrate"
 FIT: Final = "fit"
@@ -72,7 +73,7 @@ class Measured(Identity):
     max_ticks: int
     sign: Literal[1, -1]
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if not self.sign * self.min_ticks <= self.sign * self.center_ticks <= self.sign * self.max_ticks:
             ticks = f"{self.min_ticks}, {self.center_ticks}, {self.max_ticks}"
             yield f"min_ticks, center_ticks, max_ticks = {ticks} are not in the order of sign {self.sign}"
@@ -328,7 +329,7 @@ def provenance(name: str) -> tuple[dict[str, dict[str, tuple[Any, str]]], list[s
     return found, [*refused, *layers.notes]
 
 
-def _origin(key: str, config: Joint, own: Mapping[str, Any], raw: Mapping[str, Any]) -> str:
+def _origin(key: str, config: Joint, own: Facts, raw: Facts) -> str:
     if key in own:
         return "head file"
     twin = config.mirror_of

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, NonNegativeInt
 
-from sfms_robot.config.base import Model, Name, NonNegative, Positive, Share, parse, read
+from sfms_robot.config.base import Model, Name, NonNegative, Positive, Problems, Share, parse, read
 from sfms_robot.config.listener import Arig, Count, Levels, Sfms, uneven_heads
 from sfms_robot.errors import ConfigError
 
@@ -44,7 +43,7 @@ class Phase(Model):
     checkpoint_every: Count = 500
     checkpoint_minutes: Positive = 5.0
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if self.patience is not None and self.evaluate_every == 0:
             yield f"patience {self.patience} needs evaluate_every above 0"
 
@@ -119,7 +118,7 @@ class Training(Model):
     tokenizer: TokenizerTraining
     predictor: PredictorTraining
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         for name in self.predictor.group_weights:
             if name not in self.listener.groups:
                 choices = ", ".join(self.listener.groups)
@@ -140,7 +139,7 @@ class Stage(Model):
     listening: NonNegative = 0.0
     interaction: NonNegative = 0.0
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if not self.speaking + self.listening + self.interaction:
             yield "a stage needs a weight above 0 (speaking, listening, interaction)"
 
@@ -153,7 +152,7 @@ class GroupWeights(Model):
     brows: NonNegative = 1.0
     mouth: NonNegative = 1.0
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         if not self.head + self.lids + self.brows + self.mouth:
             yield "a group needs a weight above 0 (head, lids, brows, mouth)"
 
@@ -210,7 +209,7 @@ class ArigPhase(Phase):
         min_length=1,
     )
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         yield from super().contradictions()
         total = sum(stage.share for stage in self.stages)
         if abs(total - 1) > 1e-6:
@@ -271,7 +270,7 @@ class Baseline(Model):
     def codes(self) -> int:
         return math.prod(self.levels)
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         yield from uneven_heads(self.heads, width=self.width)
 
 
@@ -286,7 +285,7 @@ class Grouped(Baseline):
 
     kind: Literal["grouped"] = "grouped"
 
-    def contradictions(self) -> Iterator[str]:
+    def contradictions(self) -> Problems:
         yield from super().contradictions()
         if self.window_frames % 2**HALVINGS:
             yield f"window_frames {self.window_frames} is not a multiple of {2**HALVINGS}"

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, Final, Literal, NamedTuple
 
+from sfms_robot.data import Report
 from sfms_robot.emulator.faults import TO_SERVOS, Fault, WireFaults
 from sfms_robot.errors import ConfigError
 
@@ -183,13 +184,13 @@ class EmulatedWire:
         """Time of the next event without the host: a request arrives, an answer is due, a fault begins or ends."""
         return min([self.faults.next_s, *(out.due_s for out in self._outbox), *(each[0] for each in self._inbox)])
 
-    def statistics(self) -> dict[str, Any]:
+    def statistics(self) -> Report:
         """Return counts since the start, the lateness of answers [ms], and how long the line was busy [s]."""
         late: Sequence[float | None] = sorted(1e3 * (at_s - due_s) for _, due_s, at_s in self._stamps) or [None]
         spread = {f"p{q}": late[min(len(late) - 1, len(late) * q // 100)] for q in (50, 99)} | {"max": late[-1]}
         return {**self._counts, "busy_s": self._busy_s, "late_ms": spread}
 
-    def stamps(self) -> list[dict[str, Any]]:
+    def stamps(self) -> list[Report]:
         """Return the last answers: senders, time due, time gone."""
         return [{"ids": ids, "due_s": due_s, "sent_s": at_s} for ids, due_s, at_s in self._stamps]
 

@@ -15,7 +15,6 @@ import os
 import queue
 import shutil
 import sys
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,10 +22,11 @@ from importlib import import_module
 from typing import Any, Final, Literal, Self, cast
 
 from sfms_robot.config import FirmwareMap, load_firmware_map, variant
+from sfms_robot.data import Report
 from sfms_robot.emulator.emulated_wire import EmulatedServo, Timing
 from sfms_robot.endpoint import connect
 from sfms_robot.errors import BusError, ConfigError
-from sfms_robot.processes import Child
+from sfms_robot.processes import Child, start_thread
 from sfms_robot.servo.registers import Table
 
 __all__ = ["BehindSilent", "Chain", "EmulatedServo", "Timing", "launch", "wait"]
@@ -107,9 +107,9 @@ class Chain:
         """Set the temperature of a servo, which follows its load from then on."""
         self.ask(f"heat {servo_id} {temperature_C}")
 
-    def state(self, servo_id: int) -> dict[str, Any]:
+    def state(self, servo_id: int) -> Report:
         """Return the true state of a servo: position [ticks], goal, torque, faults, temperature_C."""
-        return cast("dict[str, Any]", self._json(f"state {servo_id}"))
+        return cast("Report", self._json(f"state {servo_id}"))
 
     def inject(self, spec: str) -> None:
         """Begin a fault, such as `drop:3=0.5` or `brownout` (see `emulator.faults`)."""
@@ -139,13 +139,13 @@ class Chain:
         """Advance virtual time to `now_s` without a host."""
         self.ask(f"time {now_s!r}")
 
-    def statistics(self) -> dict[str, Any]:
+    def statistics(self) -> Report:
         """Return bytes_in, bytes_out, replies, emulator_late, busy_s, late_ms {p50, p99, max}."""
-        return cast("dict[str, Any]", self._json("stats"))
+        return cast("Report", self._json("stats"))
 
-    def stamps(self) -> list[dict[str, Any]]:
+    def stamps(self) -> list[Report]:
         """Return the last replies: ids, due_s, sent_s."""
-        return cast("list[dict[str, Any]]", self._json("stamps"))
+        return cast("list[Report]", self._json("stamps"))
 
     def digest(self) -> tuple[str, int]:
         """Return SHA-256 and number of all bytes that hosts have sent."""
@@ -247,7 +247,7 @@ def wait(chains: Sequence[Chain]) -> Chain:
         ended.put(chain)
 
     for chain in chains:
-        threading.Thread(target=join, args=(chain,), daemon=True).start()
+        start_thread(join, "emulator", chain)
     return ended.get()
 
 

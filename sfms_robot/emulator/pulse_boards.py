@@ -17,8 +17,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
+from sfms_robot.data import Report
 from sfms_robot.emulator.emulated_wire import EmulatedDevice, EmulatedServo, Reply
 from sfms_robot.emulator.plant import MotorCommand, Plant
 from sfms_robot.emulator.register_servo import USUAL_BITS
@@ -73,7 +74,7 @@ class Channel:
         self.advance(now_s)
         self.plant.position = ticks
 
-    def state(self, now_s: float) -> dict[str, Any]:
+    def state(self, now_s: float) -> Report:
         """Return what a look at the channel shows, whatever is on the wire."""
         self.advance(now_s)
         return {

@@ -22,8 +22,9 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import reduce
-from typing import Any, Final
+from typing import Final
 
+from sfms_robot.data import Report
 from sfms_robot.emulator.control_table import (
     POSITIONING,
     TORQUE_ON_BY_GOAL,
@@ -255,7 +256,7 @@ class RegisterServo(ABC):
         self.advance(now_s)
         self.plant.position = self.frame.shaft(ticks)
 
-    def state(self, now_s: float) -> dict[str, Any]:
+    def state(self, now_s: float) -> Report:
         """Return what a look at the servo shows, whatever is on the wire."""
         self.advance(now_s)
         return {

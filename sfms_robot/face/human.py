@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.data import data_dir
-from sfms_robot.frames import POSE, SHAPES, Doubles, Floats
+from sfms_robot.frames import POSE, SHAPES, Doubles, Floats, Ints
 from sfms_robot.signals.rotations import rotation
 
 FOLDER: Final[Path] = data_dir("sim") / "heads" / "human"
@@ -44,7 +44,7 @@ class HumanHead:
     rest: Floats
     deltas: Floats
     share: Floats
-    triangles: NDArray[np.int64]
+    triangles: Ints
     colors: NDArray[np.uint8]
 
     def vertices(self, motion: Floats) -> Floats:

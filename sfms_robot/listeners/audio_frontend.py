@@ -16,7 +16,7 @@ from sfms_robot import config
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, NO_SOUND, SILENCE, Bools, Floats
 from sfms_robot.signals import mel, mfcc, phase, voice_activity
-from sfms_robot.signals.audio import energies_db
+from sfms_robot.signals.audio import energies_db, finite
 
 if TYPE_CHECKING:  # transformers, which only a listener of this kind needs
     from sfms_robot.signals.wav2vec2 import Wav2Vec2
@@ -150,7 +150,7 @@ def hear_each(
     `samples`: (640,) of each, or None or empty where there is no sound, which counts as silence. Samples that are not
     finite are silence too. Raises ValueError for another length.
     """
-    clean = [SILENCE if each is None or not len(each) else _finite(each) for each in samples]
+    clean = [SILENCE if each is None or not len(each) else finite(each)[0] for each in samples]
     for each in clean:
         check_length(each)
     rows, spoken, after = TRACKS.step_each([[each] for each in clean], before)
@@ -161,7 +161,7 @@ def hear_each(
 def track(samples: Floats) -> tuple[Floats, Bools]:
     """Return features (N, 533) and speech (N,) of a recording (n,), N = n // 640, the same as `hear_each`."""
     frames = len(samples) // FRAME_SAMPLES
-    clean = _finite(samples[: frames * FRAME_SAMPLES])
+    clean, _ = finite(samples[: frames * FRAME_SAMPLES])
     return _with_phrase(TRACKS.rows(clean).reshape(frames, MEL_WIDTH), phase.hear(voice_activity.levels_db(clean)))
 
 
@@ -191,8 +191,3 @@ def check_length(samples: Floats) -> None:
 def _with_phrase(rows: Floats, voiced: list[bool]) -> tuple[Floats, Bools]:
     places = phase.features(phase.times(voiced))
     return np.concatenate([rows, places], axis=1), np.array(voiced, dtype=np.bool_)
-
-
-def _finite(samples: Floats) -> Floats:
-    finite = np.isfinite(samples)
-    return samples if finite.all() else np.where(finite, samples, np.float32(0))

@@ -31,7 +31,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from sfms_robot import config
-from sfms_robot.errors import ModelError
+from sfms_robot.errors import ModelError, first_line
 from sfms_robot.frames import Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, Shapes, stored_tensors
 
@@ -355,8 +355,7 @@ def _session(failure: str, graph: Graph, values: Mapping[str, Any], threads: int
     try:
         return onnxruntime.InferenceSession(graph.data, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime has no class of its own for faults of a file
-        why = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise ModelError(f"{failure}: {why}") from error
+        raise ModelError(f"{failure}: {first_line(error)}") from error
 
 
 def _onnxruntime() -> Any:

@@ -39,7 +39,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.errors import ModelError
@@ -52,6 +51,8 @@ from sfms_robot.frames import (
     SHAPES,
     Doubles,
     Floats,
+    Ints,
+    Reals,
 )
 from sfms_robot.listeners.checkpoint import read_weights, write_tensors
 from sfms_robot.listeners.stream_rng import Use, normals, uniforms
@@ -84,7 +85,7 @@ class HeadSway:
         mixture, spread = self._tensors["sway_mixture"], float(self._tensors["sway_spread"])
         return draw_sway(mixture, spread, seed, self._lateral, self._shifting)
 
-    def added(self, motion: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
+    def added(self, motion: Floats, sway: Doubles, first: int | Ints) -> Floats:
         """Add the sway of each stream to motion (..., N, C) of frames `first`, `first` + 1, ..., in place.
 
         `sway`: (..., 3, 1 + L, S). `first` is of all streams, or (...) of each.
@@ -135,7 +136,7 @@ def _clocks(uniform: Doubles, channels: int, shifting: Sequence[int]) -> Doubles
     return np.stack([turn, UNEVEN / turn, 2 * math.pi * uniform[2:]])[:, second]
 
 
-def sway_at(sway: Doubles, times_s: NDArray[np.floating]) -> Floats:
+def sway_at(sway: Doubles, times_s: Reals) -> Floats:
     """Return sway (..., 3, 1 + L, S) at times (T,) since the stream began, or (..., T) of each: (..., T, S).
 
     In units of the motion; 0 before the stream began.
@@ -158,7 +159,7 @@ def as_cosines(a: Doubles, b: Doubles) -> tuple[Doubles, Doubles]:
     return np.hypot(a, b), np.arctan2(b, a)
 
 
-def sum_of_lines(times_s: NDArray[np.floating], frequency: Doubles, size: Doubles, phase: Doubles) -> Doubles:
+def sum_of_lines(times_s: Reals, frequency: Doubles, size: Doubles, phase: Doubles) -> Doubles:
     """Return the sum of lines (..., L, K), frequency [rad/s]: (..., T, K).
 
     Times are (T, 1) of all, (..., T, 1) of each, or (..., T, K) where every column has another clock.
@@ -169,7 +170,7 @@ def sum_of_lines(times_s: NDArray[np.floating], frequency: Doubles, size: Double
     return np.asarray(waves.sum(-2))
 
 
-def set_in(times_s: NDArray[np.floating]) -> Doubles:
+def set_in(times_s: Reals) -> Doubles:
     """Return 0 before a stream begins, 1 from `EASE_S` on, smooth in between."""
     begun = np.minimum(np.maximum(times_s / EASE_S, 0), 1)
     return np.asarray(begun**2 * (3 - 2 * begun))

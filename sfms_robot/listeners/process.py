@@ -30,7 +30,7 @@ import itertools
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -42,7 +42,7 @@ from sfms_robot.errors import ModelError, RobotError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, SILENCE, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.thread import CLOSE_LIMIT_S, MOST_WAITING, Inbox, Lateness, Stepped, listen
-from sfms_robot.ports import Listener
+from sfms_robot.ports import Facts, Listener
 from sfms_robot.processes import LIMITS, START_LIMIT_S, Child, Ended, ParentPipe, Supervised, cores, give_way
 from sfms_robot.signals.quantiles import Quantiles
 
@@ -160,7 +160,7 @@ class ListenerProcess:
         """Return whether it hangs, restarts, is given up, or always comes too late."""
         return self._supervised.away or self._lateness.lasting
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return `state` (starting, building, listening, late, hung, given up), `engine` in words, `restarts`,
         `skipped_frames`, `step_ms`, `hop` and `budget_ms` (see `config.hop`), None as long as no hop was chosen.
         """

@@ -25,7 +25,7 @@ import math
 import secrets
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -50,6 +50,7 @@ from sfms_robot.listeners.remote_messages import (
 from sfms_robot.listeners.remote_timing import ClockOffset, JitterBuffer
 from sfms_robot.network import LOCAL, Connection, Router, check_name, session_config
 from sfms_robot.plugins import REMOTE as PREFIX
+from sfms_robot.ports import Facts
 from sfms_robot.signals.quantiles import Quantiles
 
 if TYPE_CHECKING:
@@ -141,7 +142,7 @@ class RemoteListener:
         if self._welcome is not None:
             self._link.send(words_message(Notice("calm", calmness=calmness.model_dump())))
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the figures of `ports.PlanFeed`, and of the link: delays [ms], and counts of what was lost.
 
         `state` is joining, listening, hung or refused; `restarts` counts streams begun after the first.

@@ -46,7 +46,7 @@ from sfms_robot.listeners.remote_messages import (
     words_message,
 )
 from sfms_robot.listeners.thread import MOST_WAITING, calmed
-from sfms_robot.ports import Listener
+from sfms_robot.ports import Facts, Listener
 
 DEADLINE_S: Final = 0.080
 SILENT_S: Final = 10.0  # a stream that sends nothing for so long is dropped
@@ -87,7 +87,7 @@ class Figures:
     cpu_s: float
 
 
-def report(parts: Sequence[Figures]) -> Mapping[str, Any]:
+def report(parts: Sequence[Figures]) -> Facts:
     """Return the statistics of `serve`; `parts` are the processes of one server, one at least."""
     first = parts[0]
     scales = [each.cost_scale for each in parts if each.cost_scale is not None]

@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import logging
 import queue
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 from sfms_robot.config.listener import Calmness
 from sfms_robot.frames import FRAME_HZ, Plan, SpeakerFrame
-from sfms_robot.ports import Listener
-from sfms_robot.processes import LIMITS
+from sfms_robot.ports import Facts, Listener
+from sfms_robot.processes import LIMITS, start_thread
 from sfms_robot.signals.quantiles import Quantiles
 
 CLOSE_LIMIT_S: Final = 0.2
@@ -157,8 +156,7 @@ class ListenerThread:
         self._unanswered = self._skipped = 0  # frames
         self._since_s = 0.0  # nothing was waiting, or an answer came
         self._state = "listening"
-        self._thread = threading.Thread(target=self._work, name="listener", daemon=True)
-        self._thread.start()
+        self._thread = start_thread(self._work, "listener")
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
         """Hand over a frame. Never blocks; while the listener hangs, frames are dropped and counted."""
@@ -208,7 +206,7 @@ class ListenerThread:
         """Return whether it hangs, has failed, or is always too late."""
         return self._state != "listening" or self._lateness.lasting
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return `state` (listening, late, hung, or "failed: " and why), `restarts` 0, `skipped_frames`, `step_ms`."""
         return {
             "state": self._lateness.named(self._state),

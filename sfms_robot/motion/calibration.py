@@ -8,11 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot.config import Joint
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles, Ints
+from sfms_robot.frames import Doubles, Ints, Reals
 
 _ROUNDING_TICKS = 1e-6  # a limit this close to a whole tick is that tick
 
@@ -33,7 +32,7 @@ class Calibration:
     (`ratio` other than 1) may need several: its servo then works in extended position mode, where the model has one.
     """
 
-    def __init__(self, joints: Mapping[str, Joint], ticks_per_revolution: NDArray[np.floating]) -> None:
+    def __init__(self, joints: Mapping[str, Joint], ticks_per_revolution: Reals) -> None:
         turns = np.asarray(ticks_per_revolution, dtype=np.float64)
         self.zero_ticks = np.array([joint.zero_ticks for joint in joints.values()], dtype=np.float64)
         self.ticks_per_rad = np.array([j.sign * j.ratio for j in joints.values()]) * turns / (2 * np.pi)

@@ -26,8 +26,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from sfms_robot.errors import OutputError
-from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Floats, ListenerEvent
+from sfms_robot.errors import OutputError, first_line
+from sfms_robot.frames import CHANNEL_INDEX, NEUTRAL, Floats, ListenerEvent
 from sfms_robot.motion.limits import JerkLimiter, JointLimits, LimiterState, difference
 from sfms_robot.ports import ChannelLimit, Facts, Observer, Output, OutputFrame, Tick
 from sfms_robot.signals.minimum_jerk import ease
@@ -80,10 +80,15 @@ class MotionShaper:
 
     def start(self, now_s: float) -> Shown:
         """Return neutral."""
-        still = np.zeros(MOTION_DIM, np.float32)
         limiter = None if self._limiter is None else self._limiter.start(np.zeros(len(self._columns)))
         return Shown(
-            motion=still, phase="neutral", since_s=now_s, origin=still, before=still, here=still, limiter=limiter
+            motion=NEUTRAL,
+            phase="neutral",
+            since_s=now_s,
+            origin=NEUTRAL,
+            before=NEUTRAL,
+            here=NEUTRAL,
+            limiter=limiter,
         )
 
     def step(self, target: Floats, phase: Phase, now_s: float, shown: Shown) -> Shown:
@@ -136,7 +141,7 @@ class OutputSender:
 
     def step(self, frame: OutputFrame | None, now_s: float, ending: bool = False) -> None:
         """Send a frame, or connect. `frame`: None before the first tick. Never raises; blocks as the output does."""
-        frame = frame or OutputFrame(time_s=0.0, motion=np.zeros(MOTION_DIM, np.float32))
+        frame = frame or OutputFrame(time_s=0.0, motion=NEUTRAL)
         phase: Phase = "neutral" if ending or frame.state in ("starting", "halted") else "live"
         if frame.state == "halted" and self.output.moves:  # the end of a halted run moves nothing either
             phase = "held"
@@ -193,7 +198,7 @@ class OutputSender:
 
     def _lose(self, error: Exception, now_s: float) -> None:
         expected = isinstance(error, (OutputError, OSError))
-        text = (str(error).splitlines() or [""])[0]
+        text = first_line(error)
         self._problem = text if expected else f"{type(error).__name__}: {text}"
         if not expected:
             logger.info("output %s raised", self.name, exc_info=True)

@@ -23,7 +23,7 @@ from websockets.protocol import State
 from websockets.uri import parse_uri
 
 from sfms_robot.endpoint import address_text
-from sfms_robot.errors import OutputError
+from sfms_robot.errors import OutputError, Said
 from sfms_robot.outputs.registry import parse_address
 from sfms_robot.ports import Facts, Output, OutputFrame
 
@@ -230,7 +230,7 @@ class WebSocketOutput(Output):
         self._link: WebSocketPeer | None = None
         self._dropped = 0  # on connections before
         self._counts = (0, 0)  # sent and dropped frames when a slow peer was looked for last
-        self._noted: set[str] = set()
+        self._noted = Said()
 
     @property
     def link(self) -> WebSocketPeer:
@@ -297,8 +297,7 @@ class WebSocketOutput(Output):
 
     def note_once(self, text: str) -> None:
         """Log a warning of this output, the first time."""
-        if text not in self._noted:
-            self._noted.add(text)
+        if self._noted.first(text):
             logger.warning("output %s:%s: %s", self.kind, self.peer, text)
 
     def _note_slow(self) -> None:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from sfms_robot.frames import Plan, SpeakerFrame
-from sfms_robot.ports import Clock, Listener
+from sfms_robot.ports import Clock, Facts, Listener
 
 BUSY_S: Final = 0.04  # a tick that is this late shows: a frame of the face
 SHOWN_S: Final = 2.0  # after its last late tick an incident is over
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 _SAME: Final = 1e-6  # of a period: a clock this close to a tick is at it
 # Statistics of a feed whose steps have no duration and that leaves nothing out.
-IDLE_FEED: Final[Mapping[str, Any]] = {
+IDLE_FEED: Final[Facts] = {
     "state": "listening", "restarts": 0, "skipped_frames": 0, "step_ms": {"p50": None, "p99": None},
 }  # fmt: skip
 
@@ -139,7 +139,7 @@ class InlineFeed:
         self._coming = self._coming[len(visible) :]
         return visible
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the figures of `ports.PlanFeed`; in virtual time a step has no duration."""
         return {**IDLE_FEED, "engine": self._engine, "hop": self._listener.hop}
 

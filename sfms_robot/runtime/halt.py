@@ -34,6 +34,7 @@ from typing import Any, Final, Literal
 
 from sfms_robot.errors import ConfigError, HaltedError
 from sfms_robot.ports import Bus
+from sfms_robot.processes import start_thread
 
 Door = Literal["device", "page", "fleet"]
 
@@ -126,8 +127,7 @@ class HaltLatch:
     @contextmanager
     def watched(self, bus: Bus) -> Iterator[None]:
         """Take torque off when the loop does not answer in time, while inside."""
-        thread = threading.Thread(target=self._watch, args=(bus,), name="halt", daemon=True)
-        thread.start()
+        thread = start_thread(self._watch, "halt", bus)
         try:
             yield
         finally:
@@ -190,7 +190,7 @@ def _on_signal(number: int, act: Callable[[], None]) -> Iterator[None]:
         while came.get():
             act()
 
-    threading.Thread(target=work, name="halt signal", daemon=True).start()
+    start_thread(work, "halt signal")
     before = signal.signal(number, lambda *_: came.put(True))
     try:
         yield
@@ -265,8 +265,7 @@ def _watching(
             log.error("--halt-on %s: cannot be read: %s; end the run and look at the switch", name, error)
 
     latch.switches[name] = active
-    thread = threading.Thread(target=work, name="halt switch", daemon=True)
-    thread.start()
+    thread = start_thread(work, "halt switch")
     try:
         yield
     finally:

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.data import Report
 from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.runtime.clock import TickPace, TickTime
@@ -165,7 +166,7 @@ class RunLog:
         before = self.states[-1][1] if self.states else RunState("stopping")
         self.entered(before.ended(now_s, None if error is None else str(error)), now_s)
 
-    def state_report(self) -> dict[str, Any]:
+    def state_report(self) -> Report:
         """Return `states` of the report: seconds in each, and the newest changes with their reasons."""
         return {
             "seconds": {name: round(seconds, 3) for name, seconds in self.state_s.items()},
@@ -224,7 +225,7 @@ class RunLog:
         """Return the same during the run, as of the last call. From any thread."""
         return {f"{name}s": counter.so_far for name, counter in self._counters.items()}
 
-    def tick_report(self, target_hz: float, elapsed_s: float | None) -> dict[str, Any]:
+    def tick_report(self, target_hz: float, elapsed_s: float | None) -> Report:
         """Return `tick` of the report; wall-clock figures are null without a wall clock (`elapsed_s` None)."""
         real = elapsed_s is not None
         late_ms = self.late_ms if real else Quantiles()

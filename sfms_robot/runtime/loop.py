@@ -12,7 +12,7 @@ acceleration are central differences, so one sample lies one tick ahead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import BusError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, MOTION_DIM, Bools, Doubles, Floats, Reading
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, NEUTRAL, Bools, Doubles, Floats, Reading, Readings
 from sfms_robot.motion.limits import JerkLimiter, LimiterState, difference
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Tick, Timeline
 from sfms_robot.retarget.spontaneous import HeadLife, LifeState
@@ -108,7 +108,7 @@ class LoopState:
     lost_joints: tuple[str, ...] = ()
     answer: Fade = Fade()
     stands: bool = False
-    motion: Floats = field(default_factory=lambda: np.zeros(MOTION_DIM, np.float32))
+    motion: Floats = field(default_factory=lambda: NEUTRAL)
 
 
 def drive(
@@ -251,7 +251,7 @@ def _ended(
     run = state.run.then(now_s, ending=True)
     log.entered(run, now_s)
 
-    def seen(time_s: float, ahead: float, goals_rad: Doubles, readings: Mapping[str, Reading]) -> None:
+    def seen(time_s: float, ahead: float, goals_rad: Doubles, readings: Readings) -> None:
         """Observe a tick of the way to rest, of which the share `ahead` remains: the last face fades with it."""
         observers.tick(Tick(time_s, state.motion * np.float32(ahead), goals_rad, readings, run.name, run.why))
 
@@ -317,7 +317,7 @@ def _halted(parts: Parts, now_s: float, state: LoopState) -> LoopState:
         _let_go(parts, released)
     return replace(
         state, limiter=limiter, before_rad=goals_rad, here_rad=goals_rad, goals_rad=goals_rad, reach_s=-math.inf,
-        released=released, stands=stands, motion=np.zeros(MOTION_DIM, np.float32),
+        released=released, stands=stands, motion=NEUTRAL,
     )  # fmt: skip
 
 
@@ -333,7 +333,7 @@ def _resumed(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopS
     return replace(_eased_in_from(parts, log, state.goals_rad, every, state, now_s), released=back, stands=False)
 
 
-def _rejoined(parts: Parts, log: RunLog, readings: Mapping[str, Reading], state: LoopState, now_s: float) -> LoopState:
+def _rejoined(parts: Parts, log: RunLog, readings: Readings, state: LoopState, now_s: float) -> LoopState:
     """Ease in joints that were away again from their present angles, as at the start."""
     joints = parts.retargeter.joints
     back = np.array([joint in readings and readings[joint].rejoined for joint in joints], np.bool_)
@@ -362,9 +362,7 @@ def _eased_in_from(
     )  # fmt: skip
 
 
-def _noticed(
-    parts: Parts, readings: Mapping[str, Reading], state: LoopState, now_s: float, period_s: float
-) -> LoopState:
+def _noticed(parts: Parts, readings: Readings, state: LoopState, now_s: float, period_s: float) -> LoopState:
     """Use the readings: servos that are away, faulty or warm; a pinch while halted releases all at once."""
     heat = state.heat
     if parts.heat:

@@ -11,10 +11,11 @@ import os
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
+from sfms_robot.data import Names, Report
 from sfms_robot.frames import NO_SOUND, Plan, SpeakerFrame
-from sfms_robot.ports import Observer, Tick
+from sfms_robot.ports import Facts, Observer, Tick
 from sfms_robot.runtime.states import RUNNING, RunState
 from sfms_robot.signals.audio import energy_db
 
@@ -76,12 +77,12 @@ class RunStatus(Observer):
     def __init__(
         self,
         joints: Sequence[str],
-        facts: Mapping[str, Any],
-        figures: Callable[[], Mapping[str, Any]] = dict,
+        facts: Facts,
+        figures: Callable[[], Facts] = dict,
     ) -> None:
         self._joints, self._facts, self._figures = tuple(joints), dict(facts), figures
         self._tick: Tick | None = None
-        self._ended: dict[str, Any] = {}
+        self._ended: Report = {}
         self._frame = SpeakerFrame(0.0, NO_SOUND)
         self._planned_s: float | None = None
 
@@ -98,10 +99,10 @@ class RunStatus(Observer):
         """Show the last state of the run from now on: torque is off, or could not be confirmed off."""
         self._ended = {"state": state.name, "why": list(state.why)}
 
-    def document(self) -> dict[str, Any]:
+    def document(self) -> Report:
         """Return the document that `--status` serves. From any thread. JSON has no inf and no NaN: null."""
         seen, frame = self._tick, self._frame
-        document: dict[str, Any] = {
+        document: Report = {
             "version": 1,
             **self._facts,
             "state": "starting",
@@ -121,7 +122,7 @@ class RunStatus(Observer):
         return document | dict(self._figures())
 
 
-def _person(frame: SpeakerFrame) -> dict[str, Any]:
+def _person(frame: SpeakerFrame) -> Report:
     """Return the content of the newest frame: of the person, and of the robot's own voice."""
     return {
         "voice_db": round(energy_db(frame.audio), 1) if len(frame.audio) else None,
@@ -131,7 +132,7 @@ def _person(frame: SpeakerFrame) -> dict[str, Any]:
     }
 
 
-def _servos(seen: Tick, names: Sequence[str]) -> dict[str, Any]:
+def _servos(seen: Tick, names: Sequence[str]) -> Report:
     """Return joints, faults by name, and the hottest servo."""
     joints = {}
     for joint, goal_rad in zip(names, seen.goals_rad.tolist(), strict=True):
@@ -209,7 +210,7 @@ class NotifyingObserver(Observer):
         self._manager = manager
         self._next_s = 0.0
         self._ready = False
-        self._shown: tuple[str, tuple[str, ...]] | None = None
+        self._shown: tuple[str, Names] | None = None
 
     def tick(self, seen: Tick) -> None:
         """Send at most one datagram in most ticks, without waiting for it."""

@@ -19,6 +19,7 @@ import numpy as np
 from sfms_robot.errors import InputError
 from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, Doubles, ListenerEvent, Plan
 from sfms_robot.ports import Observer, Tick
+from sfms_robot.processes import start_thread
 from sfms_robot.signals.events import MOTION_EVENTS
 
 log = logging.getLogger(__name__)
@@ -106,8 +107,7 @@ class EventWatch(Observer):
         with self._changed:
             self._callbacks.append((kind, callback))
             if self._thread is None and not self._closing:
-                self._thread = threading.Thread(target=self._work, name="events", daemon=True)
-                self._thread.start()
+                self._thread = start_thread(self._work, "events")
 
     def tick(self, seen: Tick) -> None:
         if seen.origin_s is not None:

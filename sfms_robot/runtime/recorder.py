@@ -21,7 +21,6 @@ import json
 import logging
 import math
 import queue
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -34,9 +33,11 @@ import numpy as np
 import orjson
 from mcap.writer import Writer
 
+from sfms_robot.data import Names, Report
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, Plan, SpeakerFrame
-from sfms_robot.ports import Observer, Tick
+from sfms_robot.ports import Facts, Observer, Tick
+from sfms_robot.processes import start_thread
 from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.signals.audio import energy_db
 
@@ -44,7 +45,7 @@ RUN_FILE: Final = "run.mcap"
 REPORT_FILE: Final = "report.json"
 FullPolicy = Literal["drop", "wait"]
 RecordFormat = Literal["json", "ros2"]
-Message = tuple[str, float, dict[str, Any]]
+Message = tuple[str, float, Report]
 
 _QUEUE_LENGTH: Final = 2000  # ten seconds of a 100 Hz loop
 _CHUNK_BYTES: Final = 64 * 1024  # short stalls, and little is lost when a run is killed
@@ -59,7 +60,7 @@ _NUMBER_OR_NULL: Final = {"type": ["number", "null"]}
 _NUMBERS: Final = {"type": "array", "items": _NUMBER}
 _NUMBERS_OR_NULL: Final = {"type": ["array", "null"], "items": _NUMBER}
 _PCM16: Final = {"type": "string", "contentEncoding": "base64"}
-_CHANNELS: Final[Mapping[str, Any]] = dict.fromkeys(CHANNELS, _NUMBER_OR_NULL)
+_CHANNELS: Final[Facts] = dict.fromkeys(CHANNELS, _NUMBER_OR_NULL)
 _JOINT: Final = {
     "type": "object",
     "properties": {
@@ -69,7 +70,7 @@ _JOINT: Final = {
         "fault": {"type": ["string", "null"]},
     },
 }
-_SCHEMAS: Final[Mapping[str, Mapping[str, Any]]] = {
+_SCHEMAS: Final[Mapping[str, Facts]] = {
     "/speaker": {
         "time_s": _NUMBER,
         "audio_pcm16": _PCM16,
@@ -142,11 +143,10 @@ class Recorder(Observer):
         self._parts = 0
         self._in_part = 0
         self._events = PlannedEvents()
-        self._state: tuple[str, tuple[str, ...]] | None = None
+        self._state: tuple[str, Names] | None = None
         self._servos_s = self._searched_s = -math.inf
         self._begin()
-        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
-        self._thread.start()
+        self._thread = start_thread(self._work, "recorder")
 
     def tick(self, seen: Tick) -> None:
         """Queue a tick. The readings are copied, because the bus may change its own later."""
@@ -181,7 +181,7 @@ class Recorder(Observer):
         if self._dropped:
             _log.warning("the recording lacks %d values: the disk was too slow", self._dropped)
 
-    def statistics(self) -> dict[str, Any]:
+    def statistics(self) -> Report:
         """Return figures for the report: messages written, values dropped, bytes on disk, and trouble with the file."""
         size = sum(part.stat().st_size for part in parts_of(self._folder))
         return {"messages": self._written, "dropped": self._dropped, "bytes": size, "trouble": self._trouble}
@@ -244,7 +244,7 @@ class Recorder(Observer):
             case None:
                 yield from self._news(math.inf)
             case SpeakerFrame(face=face):
-                body: dict[str, Any] = {
+                body: Report = {
                     "time_s": value.time_s,
                     "audio_pcm16": _pcm16(value.audio),
                     "agent_audio_pcm16": None if value.agent_audio is None else _pcm16(value.agent_audio),
@@ -321,7 +321,7 @@ def _ros2_channels(writer: Writer) -> dict[str, int]:
     }
 
 
-def _as_ros2(topic: str, time_s: float, body: Mapping[str, Any], text: bytes) -> Iterator[tuple[str, bytes]]:
+def _as_ros2(topic: str, time_s: float, body: Facts, text: bytes) -> Iterator[tuple[str, bytes]]:
     """Yield the messages of ROS 2 that one of ours becomes: topic, CDR."""
     from sfms_robot.signals import ros2_messages as ros2
 
@@ -354,7 +354,7 @@ def check_folder(folder: Path, overwrite: bool = False) -> None:
         raise ConfigError(f"{folder}: holds a recording already (another folder, or --overwrite)")
 
 
-def write_report(folder: Path, report: Mapping[str, Any]) -> None:
+def write_report(folder: Path, report: Facts) -> None:
     """Write DIR/report.json, whole or not at all. An error is logged: the report is printed in any case."""
     part = folder / (REPORT_FILE + ".part")
     try:

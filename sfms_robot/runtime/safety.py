@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import FrameType
@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from sfms_robot.frames import Doubles, Reading
+from sfms_robot.frames import Doubles, Readings
 from sfms_robot.motion.limits import JerkLimiter, LimiterState
 from sfms_robot.ports import Bus
 from sfms_robot.runtime.clock import TickTime
@@ -36,7 +36,7 @@ WARM_SHARE: Final = 0.5
 COOLER_C: Final = 3.0
 PER_S: Final = 0.5  # of the share: from moving to rest in two seconds
 
-Seen = Callable[[float, float, Doubles, Mapping[str, Reading]], None]  # time, share of the way ahead, goals, readings
+Seen = Callable[[float, float, Doubles, Readings], None]  # time, share of the way ahead, goals, readings
 logger = logging.getLogger(__name__)
 
 
@@ -136,7 +136,7 @@ class HeatGuard:
         return replace(heat, share=heat.share + step)
 
 
-def temperatures_C(joints: Sequence[str], readings: Mapping[str, Reading]) -> Doubles:
+def temperatures_C(joints: Sequence[str], readings: Readings) -> Doubles:
     """Return the temperatures (J,) of the freshest readings, NaN for a servo without one."""
     known = (readings[joint].extra.get("temperature_C") if joint in readings else None for joint in joints)
     return np.array([np.nan if each is None else each for each in known])

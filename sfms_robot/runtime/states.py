@@ -21,6 +21,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
+from sfms_robot.data import Names
 from sfms_robot.frames import Doubles, SpeakerFrame
 from sfms_robot.ports import Watched
 from sfms_robot.signals import voice_activity
@@ -62,7 +63,7 @@ class RunState:
 
     name: StateName = "starting"
     since_s: float = 0.0
-    why: tuple[str, ...] = ()
+    why: Names = ()
     doing: Activity = "idle"
 
     def then(
@@ -72,8 +73,8 @@ class RunState:
         eased_in: bool = True,
         person: bool = False,
         speaking: bool = False,
-        lost: tuple[str, ...] = (),
-        halted: tuple[str, ...] = (),
+        lost: Names = (),
+        halted: Names = (),
         ending: bool = False,
     ) -> RunState:
         """Return the state at `now_s`; `since_s` changes with the name.
@@ -91,7 +92,7 @@ class RunState:
             return self
         doing: Activity = "speaking" if speaking else "listening" if person else "idle"
         name: StateName
-        why: tuple[str, ...]
+        why: Names
         if ending or self.name == "stopping":
             name, why = "stopping", ()
         elif halted:

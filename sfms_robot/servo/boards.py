@@ -29,7 +29,7 @@ from sfms_robot.servo.bus import tick_ranges
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.registers import Table, consecutive
 
 _CHUNK: Final = 4096
 _CURE: Final = "for this bus in the head's file, or change 'Enable CRC' in Pololu's Maestro Control Center"
@@ -183,13 +183,8 @@ class Maestro:
 
     def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
         """Return what moves channels to `ticks`; the goals before were sent `interval_s` ago, 0 for the first."""
-        grouped = (self._table.channels or 0) > _MICRO
-        runs: list[list[int]] = []  # of neighbouring channels, which one command can move
-        for channel in sorted(ticks):
-            if grouped and runs and channel == runs[-1][-1] + 1:
-                runs[-1].append(channel)
-            else:
-                runs.append([channel])
+        grouped = (self._table.channels or 0) > _MICRO  # one command can move neighbouring channels
+        runs = consecutive(ticks) if grouped else [[channel] for channel in sorted(ticks)]
         commands = (
             maestro.set_targets(run[0], [ticks[channel] for channel in run])
             if len(run) > 1

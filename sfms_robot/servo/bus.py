@@ -9,15 +9,15 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from sfms_robot.config import BusConfig
 from sfms_robot.errors import NOTE, BusError, PacketError, PortError, RobotError, ServoError
-from sfms_robot.frames import Doubles, Indices, Ints, Reading
-from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
+from sfms_robot.frames import Doubles, Indices, Ints, Reading, Readings
+from sfms_robot.ports import STOP_S, Facts, StopPolicy, TickConversion
 from sfms_robot.ranges import Range
 from sfms_robot.servo.policy import BusServo
 from sfms_robot.servo.port import Port
@@ -176,7 +176,7 @@ class WireBus(ABC, Generic[L]):
         """Note that the port is open again; nothing has been sent yet."""
 
     @abstractmethod
-    def _readings(self, now_s: float) -> Mapping[str, Reading]:
+    def _readings(self, now_s: float) -> Readings:
         """Return the readings of all joints."""
 
     @abstractmethod
@@ -185,7 +185,7 @@ class WireBus(ABC, Generic[L]):
 
     # --- what all do --------------------------------------------------------------------------------------------
 
-    def poll(self, now_s: float) -> Mapping[str, Reading]:
+    def poll(self, now_s: float) -> Readings:
         """Return what is known of every joint, after one poll's share of requests.
 
         Raises BusError if no servo has answered for so long that the bus has failed.
@@ -295,11 +295,11 @@ class AbsentBus:
         """Return 0 rad for every joint, or the end of its range nearest to 0."""
         return np.array([self._held[joint] for joint in joints])
 
-    def poll(self, now_s: float) -> Mapping[str, Reading]:
+    def poll(self, now_s: float) -> Readings:
         """Return a reading without a position for every joint."""
         return {joint: Reading(None, math.inf, LEFT_OUT) for joint in self.joints}
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the counters of the report."""
         faults = [f"{joint}: {LEFT_OUT}" for joint in self.joints]
         return {**dict.fromkeys(COUNTS, 0), "silent": [], "faults": faults}

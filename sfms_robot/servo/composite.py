@@ -17,13 +17,15 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
+from sfms_robot.data import Report
 from sfms_robot.errors import BusError, RobotError
-from sfms_robot.frames import Doubles, Reading
-from sfms_robot.ports import STOP_S, Bus, StopPolicy
+from sfms_robot.frames import Doubles, Reading, Readings
+from sfms_robot.ports import STOP_S, Bus, Facts, StopPolicy
+from sfms_robot.processes import start_thread
 
 log = logging.getLogger(__name__)
 
@@ -47,13 +49,12 @@ class Writer:
         self._period_s = 1.0 / rate_hz
         self._changed = threading.Condition()
         self._goals: tuple[Doubles, float] | None = None
-        self._readings: Mapping[str, Reading] = {}
+        self._readings: Readings = {}
         self._read_s = 0.0
         self._back: set[str] = set()
         self._failure: Exception | None = None
         self._closing = False
-        self._thread = threading.Thread(target=self._run, name=f"bus of {bus.joints[0]}", daemon=True)
-        self._thread.start()
+        self._thread = start_thread(self._run, f"bus of {bus.joints[0]}")
 
     def put(self, goals_rad: Doubles, now_s: float) -> None:
         """Set the goals of the next tick of the bus. Never blocks."""
@@ -61,7 +62,7 @@ class Writer:
             self._goals = goals_rad.copy(), now_s
             self._changed.notify()
 
-    def readings(self, now_s: float) -> Mapping[str, Reading]:
+    def readings(self, now_s: float) -> Readings:
         """Return the last readings, older by the time since; empty before the first tick of the bus.
 
         Raises what ended the thread, if anything did.
@@ -185,7 +186,7 @@ class CompositeBus:
         if refused is not None:
             raise refused
 
-    def poll(self, now_s: float) -> Mapping[str, Reading]:
+    def poll(self, now_s: float) -> Readings:
         """Return all readings. Raises BusError once for a bus that has failed; the next call polls the others."""
         readings: dict[str, Reading] = {}
         for name, bus in self._buses.items():
@@ -235,9 +236,7 @@ class CompositeBus:
             return
         self._stops = []
         for bus in free.values():
-            thread = threading.Thread(target=bus.stop, args=(policy,), daemon=True)
-            thread.start()
-            self._stops.append(thread)
+            self._stops.append(start_thread(bus.stop, "stop", policy))
         for name, thread in zip(free, self._stops, strict=True):
             thread.join(max(0.0, began_s + within_s - time.monotonic()))
             if thread.is_alive():
@@ -261,10 +260,10 @@ class CompositeBus:
             self._ended(name, until_s)
             bus.close()
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return totals, and the statistics of each bus under `buses`."""
         each = {name: dict(bus.statistics()) for name, bus in self._buses.items()}
-        total: dict[str, Any] = {"torque_unconfirmed": []}
+        total: Report = {"torque_unconfirmed": []}
         for counts in each.values():
             for key, value in counts.items():
                 total[key] = total[key] + value if key in total else value
@@ -273,7 +272,7 @@ class CompositeBus:
     def _working(self) -> list[tuple[str, Bus]]:
         return [(name, bus) for name, bus in self._buses.items() if name not in self._failures]
 
-    def _read(self, name: str, bus: Bus, now_s: float) -> Mapping[str, Reading]:
+    def _read(self, name: str, bus: Bus, now_s: float) -> Readings:
         writer = self._writers.get(name)
         if writer is None:
             return bus.poll(now_s)

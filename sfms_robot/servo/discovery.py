@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
+from sfms_robot.data import Report
 from sfms_robot.endpoint import host_and_port
 from sfms_robot.errors import ConfigError, PortError
 
@@ -88,7 +89,7 @@ def list_ports(root: Path = ROOT, listed: Callable[[], Iterable[Any]] = _pyseria
     ]
 
 
-def ports_data() -> list[dict[str, Any]]:
+def ports_data() -> list[Report]:
     """Return the rows of `port list` as plain data: the facts, `name` to give to --port, `problem` and `holders`."""
     return [
         {

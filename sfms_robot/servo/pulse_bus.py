@@ -17,16 +17,16 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from sfms_robot.config import BusConfig
 from sfms_robot.errors import BusError, ConfigError, RobotError
-from sfms_robot.frames import Doubles, Reading
-from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
+from sfms_robot.frames import Doubles, Reading, Readings
+from sfms_robot.ports import STOP_S, Facts, StopPolicy, TickConversion
 from sfms_robot.servo.boards import (
     TRIES,
     PulseOutput,
@@ -342,7 +342,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         except BusError as error:
             self._lose(error, now_s)
 
-    def _readings(self, now_s: float) -> Mapping[str, Reading]:
+    def _readings(self, now_s: float) -> Readings:
         """Return faults of the board, and which pulses have come on again; no positions."""
         readings = {}
         for output in self._outputs:
@@ -378,7 +378,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._flush()
         return answered
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the counters of the report."""
         return {
             **self._counts,

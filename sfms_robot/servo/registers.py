@@ -10,7 +10,7 @@ Feetech SCS.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 ASSUMED_SPEED_DEG_S = 300.0  # no-load speed if the maker states none: only an emulated motor needs one
 ByteOrder = Literal["little", "big"]
+
+Values = Mapping[str, int]  # of registers, by name
 
 _PER_TURN: Final = {"rpm": 60.0, "rev_per_min2": 3600.0}  # seconds, seconds squared; all other units are degrees
 _ACCELERATIONS: Final = ("profile_acceleration", "goal_acceleration", "acceleration")
@@ -181,6 +183,17 @@ class Table:
         """
         names, bits = self.servo_faults, [bit for bit in range(16) if status >> bit & 1]
         return [names.get(bit, f"hardware error bit {bit}") for bit in bits if bit in names or self.protocol != 1]
+
+
+def consecutive(numbers: Iterable[int]) -> list[list[int]]:
+    """Return the runs of neighbouring numbers, in order."""
+    runs: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return runs
 
 
 def span_of(fields: Sequence[Field]) -> tuple[int, int]:

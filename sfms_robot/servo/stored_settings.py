@@ -11,11 +11,11 @@ memory table V3.6 (angle limits 9 and 11, phase 18, unloading condition 19, offs
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Final, Literal
 
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.registers import Table, Values
 
 Then = Literal["refused", "set", "told"]
 
@@ -46,7 +46,7 @@ class JointNeeds:
     low_ticks: int
     high_ticks: int
     _: KW_ONLY
-    stored: Mapping[str, int] = field(default_factory=dict)
+    stored: Values = field(default_factory=dict)
     other_ids: frozenset[int] = frozenset()
     bounded_current: bool = False
     allowed_faults: Sequence[str] = ()
@@ -108,7 +108,7 @@ def limits_count(table: Table, needs: JointNeeds) -> bool:
     return not multi_turn(table, needs)
 
 
-def contradictions(values: Mapping[str, int], table: Table, needs: JointNeeds) -> list[Contradiction]:
+def contradictions(values: Values, table: Table, needs: JointNeeds) -> list[Contradiction]:
     """Return every stored value of one servo that is not as its joint needs it, in the order of importance.
 
     Args:
@@ -124,7 +124,7 @@ def contradictions(values: Mapping[str, int], table: Table, needs: JointNeeds) -
     return sorted(found, key=lambda each: ("refused", "set", "told").index(each.then))
 
 
-def _mode_and_limits(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+def _mode_and_limits(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
     """Yield another mode than that of the joint, then each limit inside the joint's range.
 
     Protocol 2.0 refuses goals beyond a limit, the others clip them silently. Many turns need both at 4095 (MX 1.0), or
@@ -159,7 +159,7 @@ def _mode_and_limits(values: Mapping[str, int], table: Table, needs: JointNeeds)
             yield Contradiction(names[1], high, needs.high_ticks, goals, then="refused")
 
 
-def _zero_and_direction(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+def _zero_and_direction(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
     """Yield each offset, reverse bit and scale that would move the joint by a wrong angle or the wrong way.
 
     Then each other register that does not hold what the head's file declares.
@@ -195,7 +195,7 @@ def offset_ticks(table: Table, stored: int) -> int:
     return -stored if table.family == "feetech" else stored
 
 
-def _acts_unasked(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Contradiction]:
+def _acts_unasked(values: Values, needs: JointNeeds) -> Iterator[Contradiction]:
     """Yield what makes a servo act without being sent a goal.
 
     That is an active secondary id (0..252), whose writes it obeys too and never answers, and what it does at power-up.
@@ -213,7 +213,7 @@ def _acts_unasked(values: Mapping[str, int], needs: JointNeeds) -> Iterator[Cont
         yield Contradiction("startup_configuration", now, 0, "it restores RAM values of an earlier time", then="told")
 
 
-def _shutdown(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+def _shutdown(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
     """Yield faults that should take the torque away and do not, or that the head ignores and do."""
     name = "unloading_condition" if table.family == "feetech" else "shutdown"
     if name not in values:
@@ -232,7 +232,7 @@ def _shutdown(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Ite
         yield Contradiction(name, now, wanted, why, then="told")
 
 
-def _turns(values: Mapping[str, int], table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
+def _turns(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
     """Yield a position beyond the one turn of position mode, or one that several turns of the joint have in common."""
     present, turn = table.role("present_position"), table.ticks_per_revolution
     if present is None or present.name not in values:

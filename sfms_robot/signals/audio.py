@@ -261,6 +261,13 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
+def finite(samples: Floats) -> tuple[Floats, int]:
+    """Return the samples, 0 for those that are not finite, and how many these are."""
+    good = np.isfinite(samples)
+    bad = samples.size - int(np.count_nonzero(good))
+    return np.where(good, samples, np.float32(0)) if bad else samples, bad
+
+
 def energy_db(samples: Floats) -> float:
     """Return the mean level of samples in dB of full scale; -100 for silence and for no samples."""
     return _db(float(np.add.reduce(np.square(samples, dtype=np.float64))), len(samples))

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sfms_robot.frames import BLINKS, CHANNEL_INDEX, SMILE_CORNERS, Doubles, Indices
+from sfms_robot.frames import BLINKS, CHANNEL_INDEX, SMILE_CORNERS, Doubles, Indices, Reals
 
 Event = tuple[float, float, float]
 _NOD_RAD: Final = np.deg2rad(1.6)
@@ -84,7 +84,7 @@ class EventKind:
         whole: the event is reported only when it is over.
     """
 
-    signal: Callable[[NDArray[np.floating]], NDArray[np.floating]]
+    signal: Callable[[Reals], Reals]
     find: Callable[[ArrayLike, float], list[Event]]
     whole: bool
 

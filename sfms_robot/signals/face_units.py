@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.errors import InputError, did_you_mean
-from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, MOTION_DIM, SHAPES, Doubles, Floats
+from sfms_robot.frames import BLENDSHAPES, CHANNEL_INDEX, CHANNELS, NEUTRAL, SHAPES, Doubles, Floats
 
 # Head pose: HeadYaw, yaw_deg, x_m, "pitch (deg)". A name that begins with "head" is measured from a camera.
 _POSE_NAME: Final = re.compile(
@@ -59,7 +59,7 @@ def pose_of(name: str) -> tuple[str, str, bool] | None:
 
 def motion_of(channels: Mapping[str, float], what: str = "face") -> Floats:
     """Return motion (58,) of some channels by any of their names, 0 elsewhere. Raises InputError for unknown names."""
-    motion = np.zeros(MOTION_DIM, dtype=np.float32)
+    motion = NEUTRAL.copy()
     for name, value in channels.items():
         if (channel := channel_of(name)) is None:
             raise InputError(

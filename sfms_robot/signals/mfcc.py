@@ -12,9 +12,8 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats, Reals
 from sfms_robot.signals.mel import FFT, HOP, WINDOW, triangles
 
 DIM: Final = 78
@@ -41,7 +40,7 @@ def mfcc78(samples: Floats) -> Floats:
     return np.asarray(stacked.reshape(frames, DIM), dtype=np.float32)
 
 
-def cepstra(windows: NDArray[np.floating]) -> Doubles:
+def cepstra(windows: Reals) -> Doubles:
     """Return (..., 13) of windows (..., 400): Kaldi's defaults with energy in place of the first."""
     centred = windows - windows.mean(axis=-1, keepdims=True)
     energy = np.log(np.maximum(np.square(centred).sum(axis=-1), ENERGY_FLOOR))

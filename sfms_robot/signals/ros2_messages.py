@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import PacketError
-from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Floats
+from sfms_robot.frames import CHANNEL_INDEX, NEUTRAL, Floats
 from sfms_robot.signals.face_tables import SHAPES_OF_UNIT
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
@@ -348,7 +348,7 @@ def units_of(motion: Floats) -> Message:
 
 def face_of(message: Message) -> Floats:
     """Return the face (58,) of action units whose confidence is above 0; what is not finite stays so."""
-    motion = np.zeros(MOTION_DIM, np.float32)
+    motion = NEUTRAL.copy()
     intensity = np.where(message["confidence"] > 0, message["intensity"], np.float32(0))
     for unit, places in _PLACES.items():
         motion[places] = np.maximum(motion[places], intensity[unit])

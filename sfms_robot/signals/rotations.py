@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sfms_robot.frames import Doubles
+from sfms_robot.frames import Doubles, Reals
 
 FROM_CAMERA: Final = [2, 0, 1]  # axes of a camera that are ours: z towards the viewer, x to the picture's right, y up
 AXIS: Final = {"roll": 0, "pitch": 1, "yaw": 2}  # the coordinate axis that each one turns about
@@ -71,7 +71,7 @@ def angles_of(matrix: Doubles) -> Doubles:
     return euler(matrix, (2, 1, 0))[..., ::-1]
 
 
-def camera_angles(matrix: NDArray[np.floating]) -> Doubles:
+def camera_angles(matrix: Reals) -> Doubles:
     """Return roll, pitch, yaw (3,) of MediaPipe's transformation matrix (4, 4), face -> camera."""
     return angles_of(matrix[np.ix_(FROM_CAMERA, FROM_CAMERA)].astype(np.float64))
 

@@ -15,19 +15,20 @@ import struct
 import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from typing import Any, Final
 
 import numpy as np
 
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, address_text, host_and_port, is_address, is_loopback
-from sfms_robot.errors import NOTE, ConfigError, PacketError, PortError
+from sfms_robot.errors import NOTE, ConfigError, PacketError, PortError, Said
 from sfms_robot.frames import (
     BLENDSHAPES,
     BLINKS,
     CHANNELS,
     MOTION_DIM,
+    NEUTRAL,
     POSE,
     POSE_CHANNELS,
     SHAPES,
@@ -37,6 +38,7 @@ from sfms_robot.frames import (
     Sighting,
     clip_shapes,
 )
+from sfms_robot.ports import Facts
 from sfms_robot.signals.face_units import LiveUnits, beyond
 from sfms_robot.signals.rotations import angles_of, rotation
 from sfms_robot.sources.live_voice import Clock, SourcePart
@@ -62,7 +64,6 @@ SILENT_S: Final = 2.0  # after so long another sender may take over, and what is
 USUAL_PORTS: Final = {"vmc": 39539, "live-link": 11111}  # what the protocol, and the app, suggest
 ANY: Final = ("0.0.0.0", "::")  # every address of this machine
 UNHEARD_S: Final = 5.0  # into a run without a sender, what to type there is logged
-_REASONS_SAID: Final = 6
 # Packets of other programs, and what to do about them.
 _FOREIGN: Final = (
     (rb"/(W|HT|HRQ?|ELR|ERR)\0", "Face Cap in live mode, which has no VMC: use Live Link Face and --face live-link"),
@@ -84,19 +85,35 @@ def parse_face_argument(kind: str, argument: str) -> tuple[str, Floats]:
 
     `argument`: the text behind `KIND:`. Raises ConfigError for another option, and for an unknown channel.
     """
-    place, signs = argument, np.ones(len(POSE_CHANNELS), dtype=np.float32)
-    while option := _OPTION.search(place):
+    place, given = split_options(f"--face {kind}", argument, "flip")
+    return place, pose_signs(kind, given)
+
+
+def split_options(flag: str, argument: str, *known: str) -> tuple[str, list[tuple[str, str]]]:
+    """Return an argument without its options (`,name=value`), and these, the last one first.
+
+    Raises ConfigError for an option that is not `known`.
+    """
+    given = []
+    while option := _OPTION.search(argument):
         name, value = option.groups()
-        if name != "flip":
-            raise ConfigError(f"--face {kind}: option {name!r} is not known (flip)")
-        for channel in value.split("+"):
-            if channel not in POSE_CHANNELS:
-                raise ConfigError(
-                    f"--face {kind}: flip = {channel!r}: expected a pose channel (valid: {', '.join(POSE_CHANNELS)})"
-                )
-            signs[POSE_CHANNELS.index(channel)] = -1.0
-        place = place[: option.start()]
-    return place, signs
+        if name not in known:
+            raise ConfigError(f"{flag}: option {name!r} is not known ({', '.join(known)})")
+        given.append((name, value))
+        argument = argument[: option.start()]
+    return argument, given
+
+
+def pose_signs(kind: str, options: Iterable[tuple[str, str]]) -> Floats:
+    """Return the sign of each pose channel, by the options `flip` of `--face KIND`. Raises ConfigError."""
+    signs = np.ones(len(POSE_CHANNELS), dtype=np.float32)
+    for channel in [each for name, value in options if name == "flip" for each in value.split("+")]:
+        if channel not in POSE_CHANNELS:
+            raise ConfigError(
+                f"--face {kind}: flip = {channel!r}: expected a pose channel (valid: {', '.join(POSE_CHANNELS)})"
+            )
+        signs[POSE_CHANNELS.index(channel)] = -1.0
+    return signs
 
 
 class LiveFace(SourcePart):
@@ -171,7 +188,7 @@ class RestingFace:
 
     def __init__(self) -> None:
         self.samples: Floats = np.zeros((0, MOTION_DIM), dtype=np.float32)
-        self._estimate: Floats = np.zeros(MOTION_DIM, dtype=np.float32)
+        self._estimate: Floats = NEUTRAL
         self._rest = self._estimate  # follows it
         self._seen_s = self._sampled_s = -math.inf
 
@@ -193,7 +210,7 @@ class RestingFace:
             self._rest = self._estimate
         self._seen_s = time_s
         # The pose as seen from the resting one, R0^T R, and the shapes above their resting level.
-        out, rest = np.zeros(MOTION_DIM, dtype=np.float32), self._rest
+        out, rest = NEUTRAL.copy(), self._rest
         both: Doubles = np.stack([rest[POSE], motion[POSE]]).astype(np.float64)
         at_rest, now = rotation(both[:, :3])
         out[POSE][:3] = angles_of(at_rest.T @ now)
@@ -279,7 +296,7 @@ class Decoder:
         """Return what is not used of this sender, in one line."""
         return None
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         return {}
 
 
@@ -324,7 +341,7 @@ class UdpSight(LiveFace):
         self._other: Address | None = None  # a second program of the sender's machine
         self._heard_s = self._result_s = -math.inf
         self._remark_s = math.inf  # when what is left out of this sender is logged
-        self._said: set[str] = set()
+        self._said = Said()
         self._refusal_said = False
         self._counts = dict.fromkeys(("packets", "faces", "malformed", "refused", "errors"), 0)
         logger.log(NOTE, "%s: %s", kind, self._hint)
@@ -371,7 +388,7 @@ class UdpSight(LiveFace):
             self._result_s = time_s
         self._remark(time_s)
 
-    def statistics(self) -> dict[str, Any]:
+    def statistics(self) -> Facts:
         """Return counts of packets, faces, malformed ones, a second sender's; the sender; what its protocol counts."""
         sender = None if self._sender is None else address_text(*self._sender[:2])
         return {**self._counts, "sender": sender, **self._decoder.statistics()}
@@ -457,11 +474,9 @@ class UdpSight(LiveFace):
 
     def _say(self, text: str, reason: str, sender: Address | None = None) -> None:
         """Log `text` with its reason, a few reasons at most, each once."""
-        key = re.sub(r"got .*", "", reason)
-        if key not in self._said and len(self._said) < _REASONS_SAID:
+        if self._said.first(reason):
             at = address_text(*(sender or self._sender or ("?", 0))[:2])
             logger.warning(text, self._kind, at, reason)
-            self._said.add(key)
 
 
 def parse_endpoint(kind: str, place: str) -> tuple[str, int]:

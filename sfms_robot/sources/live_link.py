@@ -17,14 +17,15 @@ decided over the first second (`signals.face_units`). Only what a face needs is 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNELS, ORDERS, Floats
+from sfms_robot.ports import Facts
 from sfms_robot.signals.face_units import LiveUnits
 from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
 
@@ -195,7 +196,7 @@ class LiveLinkDecoder(Decoder):
         unused = "no head angles" if self._sent < _NEEDED else f"the first {_NEEDED} are used"
         return f"{self._sent} values, not {len(_VALUES)}: {unused}"
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return counts of frames lost, doubled, late, without a face, of new counts of the phone; and its name."""
         return {**self._counts, "subject": self._subject}
 

@@ -22,7 +22,7 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from itertools import pairwise
 from numbers import Real
 from typing import Any, Final
@@ -31,7 +31,8 @@ import numpy as np
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, NO_SOUND, Floats
-from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Downmix
+from sfms_robot.ports import Facts
+from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Downmix, finite
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +72,7 @@ class SourcePart:
         with self._lock:
             self._origin_s = origin_s
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         return {}
 
     def close(self) -> None:
@@ -298,11 +299,11 @@ class LiveVoice(SourcePart):
         What is not finite counts as silence. Raises ConfigError for a rate outside 4 to 384 kHz.
         """
         check_rate(rate_hz)
-        finite, not_finite = _finite(samples)
-        if not len(finite):
+        samples, not_finite = finite(samples)
+        if not len(samples):
             return
         with self._lock:
-            mono = np.ascontiguousarray(np.clip(self.mix(finite), -1.0, 1.0))
+            mono = np.ascontiguousarray(np.clip(self.mix(samples), -1.0, 1.0))
             self._counts["not_finite"] += not_finite
             self._observe(len(mono), rate_hz, captured_s)
             if self._zero_s is not None:
@@ -317,7 +318,7 @@ class LiveVoice(SourcePart):
             whole = self._next >= (index + 1) * FRAME_SAMPLES
             return self._frames.pop(index, None) if whole else None
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return drift of the card, gaps, samples that came too late or were not finite, and the latency."""
         with self._lock:
             drift_ppm = None if self._clock is None else round(self._clock.drift_ppm, 1)
@@ -424,10 +425,3 @@ def check_rate(rate_hz: float) -> None:
     """Raise ConfigError for a rate that speech does not have, and for one that is not a number."""
     if not isinstance(rate_hz, Real) or not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
         raise ConfigError(f"rate_hz = {rate_hz!r}: expected a rate of speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")
-
-
-def _finite(samples: Floats) -> tuple[Floats, int]:
-    """Return the samples, 0 for those that are not finite, and how many these are."""
-    finite = np.isfinite(samples)
-    not_finite = samples.size - int(np.count_nonzero(finite))
-    return np.where(finite, samples, np.float32(0)) if not_finite else samples, not_finite

@@ -11,16 +11,17 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
+from sfms_robot.data import Report
 from sfms_robot.errors import NOTE
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, SILENCE, Floats
-from sfms_robot.ports import Voice
+from sfms_robot.ports import Facts, Voice
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
 from sfms_robot.signals.own_voice_gate import OwnVoiceGate
 from sfms_robot.sources.live_voice import LiveVoice, latency_after, window
@@ -93,7 +94,7 @@ class MicrophoneFrame:
     said: Floats | None = None
 
 
-MicrophoneMessage = str | MicrophoneFrame | dict[str, Any]  # the first is the name of the device
+MicrophoneMessage = str | MicrophoneFrame | Report  # the first is the name of the device
 
 
 def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker | None, None]:
@@ -215,11 +216,11 @@ class FrontEnd:
             self._next, self._waiting = self._next + 1, None
         return frames
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return those of the microphone (`LiveVoice`), and frames with a voice; with a reference, its own, frames in
         which the robot spoke, and frames whose reference was not there in time.
         """
-        figures: dict[str, Any] = {**self.mic.statistics(), "voice_frames": self._counts["voice_frames"]}
+        figures: Report = {**self.mic.statistics(), "voice_frames": self._counts["voice_frames"]}
         if self._reference is not None:
             figures |= self._counts
         if isinstance(self._reference, LiveVoice):
@@ -264,7 +265,7 @@ class Microphone:
         self.device = ""
         self.latency_s = 0.0
         self._late_frames = 0
-        self._figures: Mapping[str, Any] = {}
+        self._figures: Facts = {}
         self._logged: set[str] = set()
         self._said: dict[int, Floats | None] = {}
         self._speed_rad_s = self._sent_speed_rad_s = 0.0
@@ -313,7 +314,7 @@ class Microphone:
         """Return what the loudspeaker near it was given in a frame that was taken just now."""
         return self._said.get(index)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return device, latency, frames that came too late, state of the worker, and figures of the sound."""
         return {
             "device": self.device,
@@ -375,7 +376,7 @@ class Loudspeaker:
         """Return what was recorded one frame before, with the microphone's; two before, without a microphone."""
         return self._recorder.said(index - 1) if self._beside else self._recorder.take(index - 2)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         figures = self._recorder.statistics()
         return figures.get("reference", {}) if self._beside else figures
 

@@ -18,7 +18,7 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -26,6 +26,7 @@ import numpy as np
 from sfms_robot.endpoint import LOOPBACK, address_text, host_and_port, is_loopback, token_admits
 from sfms_robot.errors import ConfigError, PacketError, PortError
 from sfms_robot.frames import AUDIO_HZ, Floats
+from sfms_robot.ports import Facts
 from sfms_robot.sources.live_face import LiveFace
 from sfms_robot.sources.live_voice import Clock, SourcePart
 from sfms_robot.sources.net_messages import (
@@ -123,7 +124,7 @@ class NetPerson(NetServer):
         self._place = (host, port)
         self._feeds: dict[str, _NetPart] = {}
         self._origin_s = 0.0
-        self._state: Mapping[str, Any] | None = None
+        self._state: Facts | None = None
         self._intake = Intake(now)
         self.token = None if is_loopback(self.address[0]) else secrets.token_urlsafe(12)
         at = address_text(*self.address)
@@ -162,7 +163,7 @@ class NetPerson(NetServer):
         event = {"type": kind, "at_s": round(self._origin_s + time_s, 4), **values}
         self.post(lambda: self._send_event(event))
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the server's counts, sound and faces that were too late or too fast, and which program feeds what."""
         feeders = {name: part.feeder for name, part in self._feeds.copy().items()}
         named = {name: feeder.name for name, feeder in feeders.items() if feeder is not None}
@@ -242,7 +243,7 @@ class NetPerson(NetServer):
             for connection in wanting:
                 connection.send(message)
 
-    def _send_event(self, event: Mapping[str, Any]) -> None:
+    def _send_event(self, event: Facts) -> None:
         if event["type"] == "state":
             self._state = event
         for connection in self._wanting("events"):
@@ -272,7 +273,7 @@ class _NetPart(SourcePart):
         self.outlet.begin(origin_s)
         super().start(origin_s)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         return {**super().statistics(), "net": self.outlet.statistics()}
 
     def close(self) -> None:
@@ -355,7 +356,7 @@ class PageVisitor:
             else:
                 self._intake.see(self.sight, message, self._clock)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return counts of messages that came too late, and of sound that came faster than time passes."""
         return dict(self._intake.counts)
 
@@ -377,7 +378,7 @@ class BrowserVoice(PushedVoice):
         super().__init__(visitor.now)
         self._visitor = visitor
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         return {**super().statistics(), **self._visitor.statistics()}
 
 
@@ -396,7 +397,7 @@ class BrowserSight(LiveFace):
         if face is not None:
             self.put(self._now() if seen_s is None else seen_s, face)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         return self._visitor.statistics()
 
 

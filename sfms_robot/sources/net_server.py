@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import re
 import socket
 import struct
 import sys
@@ -33,7 +32,7 @@ from websockets.http11 import Request
 from websockets.server import ServerProtocol
 
 from sfms_robot.endpoint import ServerThread, address_text, origin_problem
-from sfms_robot.errors import PacketError
+from sfms_robot.errors import PacketError, Said
 from sfms_robot.sources.net_messages import LONGEST, Message, SenderClock, json_message, parse_message
 
 logger = logging.getLogger(__name__)
@@ -49,7 +48,6 @@ LAST_WORDS_S: Final = 0.2  # that a program gets to read why it is closed
 _SLICE: Final = TURN_BYTES // TURN_MESSAGES  # bytes of a WebSocket that are read at once
 _MOST_READ: Final = 4 * LONGEST  # bytes of a WebSocket's message; a longer one closes the connection
 _STOP_S: Final = 2.0
-_MOST_SAID: Final = 20
 _HTTP: Final = b"GET "
 _LENGTH: Final = struct.Struct("<I")
 _REASON: Final = 120  # bytes of a closing frame's text
@@ -72,7 +70,7 @@ class NetServer(ServerThread):
     def __init__(self, flag: str, host: str, port: int) -> None:
         self.counts = dict.fromkeys(("connections", "refused", "messages", "malformed", "missed"), 0)
         self.connections: set[NetProgram] = set()
-        self._said: set[str] = set()
+        self._said = Said()
         super().__init__(flag, host, port, _STOP_S)
         self._posted: deque[Callable[[], None]] = deque(maxlen=4 * OUTBOX)
 
@@ -97,9 +95,7 @@ class NetServer(ServerThread):
 
     def say_once(self, key: str, text: str) -> None:
         """Log one line for `key`, whatever its numbers, the first time."""
-        key = re.sub(r"\d+", "", key)
-        if key not in self._said and len(self._said) < _MOST_SAID:
-            self._said.add(key)
+        if self._said.first(key):
             logger.warning("%s (said once)", text)
 
     def _work(self) -> None:
@@ -137,7 +133,7 @@ class NetProgram:
     def __init__(self, server: NetServer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.name = address_text(*writer.get_extra_info("peername", ("an unknown address", 0))[:2])
         self.greeted, self.malformed, self.clock = False, 0, SenderClock()
-        self._told: set[str] = set()
+        self._told = Said()
         self.wants: frozenset[str] = frozenset()
         self._server, self._reader, self._writer = server, reader, writer
         self._loop = asyncio.get_running_loop()
@@ -185,9 +181,7 @@ class NetProgram:
 
     def tell_once(self, problem: str) -> None:
         """Tell it, and the log, the first time of a problem, whatever its numbers."""
-        key = re.sub(r"\d+", "", problem)
-        if key not in self._told:
-            self._told.add(key)
+        if self._told.first(problem):
             self.tell(problem)
             self._server.say_once(problem, f"{self.name}: {problem}")
 

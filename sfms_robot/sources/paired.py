@@ -19,12 +19,13 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sfms_robot.data import Names, Report
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import (
     BLENDSHAPES,
@@ -37,7 +38,7 @@ from sfms_robot.frames import (
     Sighting,
     SpeakerFrame,
 )
-from sfms_robot.ports import Outlet, Sight, Source, Voice
+from sfms_robot.ports import Facts, Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
 from sfms_robot.signals.face_units import beyond
 from sfms_robot.signals.quantiles import Quantiles
@@ -78,7 +79,7 @@ class PairedSource:
             raise ConfigError(f"--duration = {duration_s:g}: a run lasts more than 0 s and ends")
         self.duration_s = _length_s(voice, sight, agent) if duration_s is None else duration_s
         self.latency_s = 0.0
-        self.missing: tuple[str, ...] = ()
+        self.missing: Names = ()
         self._voice, self._sight, self._agent = voice, sight, agent
         parts: dict[str, Voice | Sight | None] = {"voice": voice, "face": sight, "agent_audio": agent}
         self._parts = {name: part for name, part in parts.items() if part is not None}
@@ -115,14 +116,14 @@ class PairedSource:
         if (moves := getattr(self._voice, "moves", None)) is not None:
             moves(speed_rad_s)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return those of the grid, and under `voice`, `face` and `agent_audio` their own.
 
         frames, overruns (frames without the voice that should be in them), faces_lost (frames whose face was too old),
         left_out (by what it was), wait_ms from the end of a frame until it was given, face_age_ms at the end of its
         frame.
         """
-        figures: dict[str, Any] = {
+        figures: Report = {
             "frames": self._given,
             "overruns": self._overruns,
             "left_out": dict(self._judge.left_out),
@@ -184,7 +185,7 @@ class JudgedSource:
             raise ConfigError(f"{type(inner).__name__} lacks {', '.join(missing)}: derive it from sfms_robot.Source")
         self.duration_s = inner.duration_s
         self.latency_s = inner.latency_s
-        self.missing: tuple[str, ...] = ()
+        self.missing: Names = ()
         self._inner = inner
         self.outlets: Sequence[Outlet] = tuple(getattr(inner, "outlets", ()))
         self._judge = FrameJudge()
@@ -206,7 +207,7 @@ class JudgedSource:
         self.latency_s, self.missing = self._inner.latency_s, tuple(self._inner.missing)
         return frames
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return frames so far, what was left out of them, and the inner source's own statistics."""
         return {"frames": self._given, "left_out": dict(self._judge.left_out), **self._inner.statistics()}
 

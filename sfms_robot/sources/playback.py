@@ -15,7 +15,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from contextlib import closing
 from dataclasses import dataclass
 from statistics import median
@@ -23,8 +23,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from sfms_robot.data import Report
 from sfms_robot.errors import NOTE
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, NO_SOUND, SILENCE, Floats
+from sfms_robot.ports import Facts
 from sfms_robot.signals.audio import at_positions
 from sfms_robot.sources.live_voice import GAP_S, LARGEST_PULL, PULL_S, Clock, SampleClock, window
 from sfms_robot.sources.push import Spoken
@@ -78,7 +80,7 @@ class Silence:
     last: int
 
 
-PlaybackMessage = PlaybackOpened | Silence | dict[str, Any]
+PlaybackMessage = PlaybackOpened | Silence | Report
 
 
 def play(wanted: str) -> Generator[PlaybackMessage | None, Speech | None, None]:
@@ -210,7 +212,7 @@ class Playout:
         self._lacks(max(begins, first + len(said)), self._next)
         return at_positions(said, begins - first + ratio * np.arange(n, dtype=np.float64))
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return how often the device ran dry, jumps, and the drift of the card."""
         drift_ppm = None if self._clock is None else round(self._clock.drift_ppm, 1)
         return {**self._counts, "drift_ppm": drift_ppm}
@@ -274,7 +276,7 @@ class PlayedVoice:
         self._leaves: tuple[int, Floats] = (0, NO_SOUND)  # from which sample of the loop on, and what
         self._speaks = False
         self._unsaid = 0
-        self._told: Mapping[str, Any] = {}
+        self._told: Facts = {}
         self._collect()
         self.duration_s = None if spoken.duration_s is None else spoken.duration_s + self.delay_s
         self.outlet = getattr(spoken, "outlet", None)
@@ -326,7 +328,7 @@ class PlayedVoice:
             self._leaves = (begin, np.concatenate([leaves[:cut], fading * _FADE[: len(fading)], silent]))
             self._tell()
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return device, process, delay, how often it ran dry, sound not heard [ms]; and those of what is said."""
         return {
             "device": self.device, **self._loudspeaker.statistics(), **self._told,

@@ -12,19 +12,19 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, ClassVar, Final, Protocol
+from typing import ClassVar, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError, InputError
-from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, NO_SOUND, FaceFrame, Floats, Sighting
-from sfms_robot.ports import Voice
-from sfms_robot.signals.audio import Downmix, Resampler, check_scale
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, NO_SOUND, FaceFrame, Floats, Reals, Sighting
+from sfms_robot.ports import Facts, Voice
+from sfms_robot.signals.audio import Downmix, Resampler, check_scale, finite
 from sfms_robot.signals.face_units import beyond, motion_of
 from sfms_robot.sources.live_voice import Clock, LiveVoice, Pace, SourcePart, check_rate, window
 
-Pcm = bytes | NDArray[np.floating] | NDArray[np.int16]
+Pcm = bytes | Reals | NDArray[np.int16]
 
 HEARD_S: Final = 1.0  # a person's voice that is older than this is no use to a listener
 SAID_S: Final = 120.0  # speech is synthesized faster than it is spoken, a sentence at once
@@ -102,7 +102,7 @@ class PushedVoice(LiveVoice):
             self.push(kept, rate_hz, captured_s, now_s)
         self.pace.warn_once(self._way)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         return {
             **super().statistics(),
             "dropped": self._dropped,
@@ -120,7 +120,7 @@ class PushedSight(SourcePart):
 
     def see(
         self,
-        face: FaceFrame | NDArray[np.floating] | Mapping[str, float] | None,
+        face: FaceFrame | Reals | Mapping[str, float] | None,
         seen_s: float | None = None,
         attention: float | None = None,
     ) -> None:
@@ -191,8 +191,7 @@ class PushedSpeech(SourcePart):
         check_rate(rate_hz)
         if at_s is not None and not np.isfinite(at_s):
             raise ConfigError(f"at_s = {at_s!r}: expected a finite time")
-        samples = as_floats(pcm)
-        finite = np.isfinite(samples)
+        samples, not_finite = finite(as_floats(pcm))
         if at_s is not None and self._player is not None:
             at_s -= self._player.delay_s
         soonest = _place(self._now()) + FRAME_SAMPLES
@@ -204,8 +203,8 @@ class PushedSpeech(SourcePart):
                 self._begin(at, rate_hz)
             assert self._resampler is not None
             self._given += len(samples)
-            self._counts["not_finite"] += int(samples.size - finite.sum())
-            self._append(self._resampler.push(np.clip(np.where(finite, samples, np.float32(0)), -1.0, 1.0)))
+            self._counts["not_finite"] += not_finite
+            self._append(self._resampler.push(np.clip(samples, -1.0, 1.0)))
         if self._player is not None:
             self._player.said()
 
@@ -247,7 +246,7 @@ class PushedSpeech(SourcePart):
         with self._lock:
             return self._frame(self._origin + index * FRAME_SAMPLES) if self._speaks else None
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return samples to be played in more than two minutes (dropped), said too late to be played, or not finite."""
         with self._lock:
             return dict(self._counts)

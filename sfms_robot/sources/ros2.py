@@ -9,9 +9,8 @@ else ROS_DOMAIN_ID, else 0. Messages count from their arrival: the clocks of the
 from __future__ import annotations
 
 import logging
-import re
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Final
+from collections.abc import Callable
+from typing import ClassVar, Final
 
 import numpy as np
 
@@ -19,9 +18,10 @@ from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import AUDIO_HZ, FRAME_S, Floats, Sighting, clip_shapes
 from sfms_robot.network import LOCAL, Ros2Node, Router, ros_domain, ros_topic
+from sfms_robot.ports import Facts
 from sfms_robot.signals.face_units import beyond
 from sfms_robot.signals.ros2_messages import ACTION_UNITS, AUDIO, Message, face_of, read_message, wire_name
-from sfms_robot.sources.live_face import LOST_S, UNHEARD_S, LiveFace, parse_face_argument
+from sfms_robot.sources.live_face import LOST_S, UNHEARD_S, LiveFace, pose_signs, split_options
 from sfms_robot.sources.live_voice import SourcePart, check_rate
 from sfms_robot.sources.push import PushedVoice
 
@@ -29,18 +29,7 @@ logger = logging.getLogger(__name__)
 
 SILENT_S: Final = 1.0  # a voice that is away for so long is lost: publishers send silence too
 MOST_CHANNELS: Final = 8
-_OPTION: Final = re.compile(r",([a-z]+)=([^,=]*)$")
 _FILES: Final = (b"RIFF", b"ID3", b"OggS", b"fLaC")  # begin sound files
-
-
-def _options(flag: str, argument: str, **given: str) -> tuple[str, dict[str, str]]:
-    """Return what stands before the options of `PLACE,NAME=VALUE`, and these; `given`: defaults. Raises ConfigError."""
-    place, given = argument, {"domain": "", **given}
-    while option := _OPTION.search(place):
-        if option[1] not in given:
-            raise ConfigError(f"{flag}: option {option[1]!r} is not known ({', '.join(given)})")
-        place, given[option[1]] = place[: option.start()], option[2]
-    return place, given
 
 
 class _Subscriber(SourcePart):
@@ -64,7 +53,7 @@ class _Subscriber(SourcePart):
             received=lambda _, wire, data: take(read_message(kind, wire, data)),
         )
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the node's counts of messages, and those of what they become."""
         return {**super().statistics(), **self._node.counts}
 
@@ -89,7 +78,8 @@ class Ros2Voice(_Subscriber, PushedVoice):
 
     def __init__(self, argument: str, router: Router = LOCAL) -> None:
         super().__init__()
-        place, given = _options(self._way, argument, rate=str(AUDIO_HZ), channels="1")
+        place, options = split_options(self._way, argument, "domain", "rate", "channels")
+        given = {"domain": "", "rate": str(AUDIO_HZ), "channels": "1", **dict(options)}
         try:
             self._sent_hz, self._channels = whole_number(given["rate"]), whole_number(given["channels"])
             check_rate(self._sent_hz)
@@ -118,10 +108,10 @@ class Ros2Sight(_Subscriber, LiveFace):
     _flag = "--face ros2"
 
     def __init__(self, argument: str, router: Router = LOCAL) -> None:
-        place, given = _options(self._flag, argument, flip="")
-        super().__init__(parse_face_argument("ros2", f",flip={given['flip']}" if given["flip"] else "")[1])
+        place, options = split_options(self._flag, argument, "domain", "flip")
+        super().__init__(pose_signs("ros2", options))
         topic = place if "/" in place else f"/humans/faces/{place}/facs"
-        self._subscribe(topic, given["domain"], router, kind=ACTION_UNITS, take=self._see)
+        self._subscribe(topic, dict(options).get("domain", ""), router, kind=ACTION_UNITS, take=self._see)
 
     def at(self, time_s: float) -> Sighting | None:
         self._look(time_s, LOST_S)

@@ -32,7 +32,8 @@ import numpy as np
 
 from sfms_robot.endpoint import addresses_of_this_machine
 from sfms_robot.errors import PacketError
-from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, POSE, SHAPES, Doubles, Floats
+from sfms_robot.frames import BLENDSHAPES, NEUTRAL, POSE, SHAPES, Doubles, Floats
+from sfms_robot.ports import Facts
 from sfms_robot.signals.face_units import LiveUnits, channel_of, used_line
 from sfms_robot.signals.rotations import angles_of
 from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
@@ -216,7 +217,7 @@ class VmcDecoder(Decoder):
         moved = {name for place in self._known for name in _PRESETS.get(_NAMES[place], {_NAMES[place]: 1.0})}
         return used_line(moved, [name.decode("utf-8", "replace") for name in self._unknown]) if self._unknown else None
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return counts of messages, those of unexpected types, losses of tracking, and unknown names."""
         return {**self._counts, "unknown_names": len(self._unknown)}
 
@@ -276,7 +277,7 @@ class VmcDecoder(Decoder):
         changed, self._changed = self._changed, False
         if not changed or self.blind:
             return None
-        motion = np.zeros(MOTION_DIM, dtype=np.float32)
+        motion = NEUTRAL.copy()
         motion[POSE][:3] = angles_of((self._bones[b"neck"] @ self._bones[b"head"])[None])[0]
         motion[SHAPES] = self._shapes
         return motion

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from sfms_robot.data import data_dir
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, PortError, optional
-from sfms_robot.frames import BLENDSHAPES, Floats, Sighting
+from sfms_robot.frames import BLENDSHAPES, Floats, Reals, Sighting
+from sfms_robot.ports import Facts
 from sfms_robot.signals.quantiles import Quantiles
 from sfms_robot.signals.rotations import FROM_CAMERA, camera_angles
 from sfms_robot.sources.live_face import LiveFace, parse_face_argument
@@ -245,7 +246,7 @@ def _why_not(number: int) -> str:
 # Sideways and up are not affected, since there the lens cancels out.
 
 
-def seen_face(matrix: NDArray[np.floating], shapes: Mapping[str, float]) -> SeenFace:
+def seen_face(matrix: Reals, shapes: Mapping[str, float]) -> SeenFace:
     """Return a face of its `matrix` (4, 4) face -> camera; `shapes` by MediaPipe's names, 0 where missing."""
     pose = (*camera_angles(matrix), *matrix[FROM_CAMERA, 3] / 100.0)
     eyes_m = (matrix @ np.array(_EYES_CM))[:3] / 100.0
@@ -334,7 +335,7 @@ class Webcam(LiveFace):
         self.lost = self._worker.lost
         return super().at(time_s)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the state of the worker; counts of pictures, without a face, dark, with other people; latency."""
         return {
             **self._worker.statistics(),

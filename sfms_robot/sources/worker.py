@@ -21,11 +21,12 @@ started again after a pause that grows (`processes.LIMITS["source"]`).
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator
 from contextlib import suppress
 from typing import Any, Final
 
 from sfms_robot.errors import PortError, RobotError
+from sfms_robot.ports import Facts
 from sfms_robot.processes import LIMITS, START_LIMIT_S, Child, Ended, ParentPipe, Supervised, give_way
 
 CLOSE_LIMIT_S: Final = 0.2
@@ -97,7 +98,7 @@ class SourceWorker:
         """Return whether it is away, or being started again."""
         return self._ended is None and self._supervised.away
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return `state` (starting, running, lost, finished, closed), `restarts`, `dropped` (messages)."""
         phase = self._supervised.phase
         return {

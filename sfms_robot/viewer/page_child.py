@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import pickle
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -13,8 +13,10 @@ from typing import Any, Final
 
 import orjson
 
+from sfms_robot.data import Report
 from sfms_robot.errors import RobotError
 from sfms_robot.face.robot_scene import RobotScene
+from sfms_robot.ports import Facts
 from sfms_robot.processes import ParentPipe, PipeWriter, give_way
 from sfms_robot.viewer.page_messages import LONGEST_PERSON
 from sfms_robot.viewer.page_process import BEAT_S, Address
@@ -49,7 +51,7 @@ class FromRun:
             else:
                 self._page.show(message)
 
-    def _document(self, visitor: int, told: dict[str, Any]) -> None:
+    def _document(self, visitor: int, told: Report) -> None:
         do = told.pop("do")
         if do == "begin":
             self._page.begin(told, partial(self._scene_of, told.pop("scene", ""), told.pop("packages", ())))
@@ -76,7 +78,7 @@ def main(scene_of: SceneOf = lambda *_: None) -> None:
 async def _serve(address: Address, parent: ParentPipe, scene_of: SceneOf) -> None:
     writer = PipeWriter(parent.outgoing, MOST_UNSENT, "run")
 
-    def send(visitor: int, content: Mapping[str, Any] | bytes) -> None:
+    def send(visitor: int, content: Facts | bytes) -> None:
         """Send a document, or a piece of a visitor's voice, or a face, without waiting."""
         (writer.offer if isinstance(content, bytes) else writer.send)(pickle.dumps((visitor, content)))
 

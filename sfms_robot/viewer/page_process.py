@@ -11,7 +11,7 @@ their commands.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,7 @@ import orjson
 
 from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PortError, RobotError
+from sfms_robot.ports import Facts
 from sfms_robot.processes import LIMITS, Child, Ended, Supervised
 
 START_LIMIT_S: Final = 30.0  # importing on a small board with a cold disk
@@ -61,7 +62,7 @@ class Address:
 class Asked(Protocol):
     """The receiver of visitors' commands. Called in a thread of the page's; a RobotError is sent to the visitor."""
 
-    def command(self, visitor: int, name: str, values: Mapping[str, Any]) -> None:
+    def command(self, visitor: int, name: str, values: Facts) -> None:
         """Do what a visitor with the controls wants."""
 
     def person(self, visitor: int, message: bytes) -> None:
@@ -134,7 +135,7 @@ class PageProcess:
         """Return whether it has given no sign of life for a while; see `watch`."""
         return self._supervised.hung
 
-    def statistics(self) -> dict[str, Any]:
+    def statistics(self) -> Facts:
         """Return for status and report: whether it hangs now, and how often it has."""
         return {"hung": self.hung, "hangs": self._supervised.hangs}
 

@@ -19,22 +19,23 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from sfms_robot.data import data_dir
+from sfms_robot.data import Report, data_dir
 from sfms_robot.endpoint import token_admits
 from sfms_robot.errors import PacketError
 from sfms_robot.face.human import FOLDER as HUMAN
 from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.frames import FRAME_HZ
+from sfms_robot.ports import Facts
 from sfms_robot.viewer.page_messages import VERSION, Shown, frame_json, message_json, parse_command
 from sfms_robot.viewer.web_server import CompressedFiles, application
 
@@ -52,7 +53,7 @@ FREE: Final = ("hello", "ping", "take", "give")  # commands that take no control
 _LINES_AT_ONCE: Final = 10  # of a platform each takes a millisecond and a half
 
 NewScene = Callable[[], RobotScene | None]
-Send = Callable[[int, Mapping[str, Any] | bytes], None]
+Send = Callable[[int, Facts | bytes], None]
 
 
 class Visitor:
@@ -217,13 +218,13 @@ class PageServer:
     def __init__(self, send: Send, token: str | None) -> None:
         self._send_run, self._token = send, token
         self._visitors = Visitors(token, lambda number: send(number, {"left": True}), time.monotonic)
-        self._hello: dict[str, Any] = {}
+        self._hello: Report = {}
         self._began = asyncio.Event()  # there is a hello
         self._new_scene: NewScene = lambda: None
         self._scene: RobotScene | None = None
-        self._record: Mapping[str, Any] | None = None
+        self._record: Facts | None = None
         self._recording: Path | None = None
-        self._over: Mapping[str, Any] | None = None  # the report
+        self._over: Facts | None = None  # the report
         self._history: deque[tuple[bool, bytes]] = deque(maxlen=KEPT_FRAMES)  # (packed picture or not, message)
         self._files, self._human = CompressedFiles(), CompressedFiles(HUMAN)
         self.app = application(
@@ -246,13 +247,13 @@ class PageServer:
 
     # --- from the run ---
 
-    def begin(self, hello: Mapping[str, Any], new_scene: NewScene) -> None:
+    def begin(self, hello: Facts, new_scene: NewScene) -> None:
         """Begin a run: forget the last one, and send its `hello` to all visitors.
 
         `new_scene`: makes the picture of its head. One remembers where it was; a replay has its own.
         """
         self._new_scene, self._scene, self._over = new_scene, new_scene(), None
-        drawn: dict[str, Any] = {}
+        drawn: Report = {}
         if (scene := self._scene) is not None:
             drawn = {"urdf": URDF, "urdf_joints": scene.joints, "urdf_generic": scene.generic}
         self._hello = {**hello, **drawn}
@@ -280,7 +281,7 @@ class PageServer:
         for visitor in self._visitors:
             visitor.tell(message)
 
-    def end(self, report: Mapping[str, Any]) -> None:
+    def end(self, report: Facts) -> None:
         """Send visitors the report of the run, which is over."""
         self._over = report
         self.tell(message_json(type="over", report=report))
@@ -291,7 +292,7 @@ class PageServer:
         if visitor is not None:
             visitor.tell(message)
 
-    def recorded(self, file: Path | None, record: Mapping[str, Any] | None) -> None:
+    def recorded(self, file: Path | None, record: Facts | None) -> None:
         """Set the file of /recording, and `record` of the hello."""
         self._recording, self._record = file, record
         if record is not None:
@@ -385,7 +386,7 @@ class PageServer:
             if pause_s := visitor.pause_s(cost_s, time.monotonic()):
                 await asyncio.sleep(pause_s)
 
-    def _command(self, visitor: Visitor, name: str, values: dict[str, Any]) -> None:
+    def _command(self, visitor: Visitor, name: str, values: Report) -> None:
         if name == "hello":
             self._visitors.greet(visitor, **values)
         elif name == "ping":

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Final, Protocol
 
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
@@ -21,6 +21,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
+from sfms_robot.data import Report
 from sfms_robot.endpoint import token_admits
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.human import FOLDER as HUMAN
@@ -41,7 +42,7 @@ class Comparison(Protocol):
 
     def begin(self) -> str: ...
 
-    def next(self, participant: str) -> dict[str, Any]: ...
+    def next(self, participant: str) -> Report: ...
 
     def answer(self, participant: str, number: int, chosen: Mapping[str, str]) -> None: ...
 

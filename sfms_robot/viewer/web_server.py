@@ -23,7 +23,7 @@ import secrets
 import socket
 import ssl
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -38,8 +38,10 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from sfms_robot.data import Report
 from sfms_robot.endpoint import LOOPBACK, address_text, host_problem, is_loopback, listen, origin_problem, port_number
 from sfms_robot.errors import ConfigError, InputError, RobotError
+from sfms_robot.ports import Facts
 from sfms_robot.viewer.page_process import Address
 
 MOST_CONNECTIONS: Final = 32
@@ -59,7 +61,7 @@ _HEADERS: Final = {
 }
 _GZIP_LEVEL: Final = 6
 
-Document = Callable[[], Mapping[str, Any]]
+Document = Callable[[], Facts]
 
 
 # --- the access rules -----------------------------------------------------------------------------------------------
@@ -95,7 +97,7 @@ async def _refused(request: Request, error: Exception) -> Response:
     return PlainTextResponse(f"{error}\n", 400)
 
 
-async def json_body(request: Request) -> dict[str, Any]:
+async def json_body(request: Request) -> Report:
     """Return the JSON object that a request carries; {} for an empty body. Raises InputError."""
     body = b""
     async for part in request.stream():
@@ -171,7 +173,7 @@ class WebLoop(asyncio.SelectorEventLoop):
         """Make a server as asyncio does."""
         return await super().create_server(*given, ssl=ssl, ssl_handshake_timeout=ssl and CONNECTION_S, **more)
 
-    def call_exception_handler(self, context: dict[str, Any]) -> None:
+    def call_exception_handler(self, context: Report) -> None:
         """Report an error, unless no descriptor is free for a connection: asyncio tries again a second later."""
         if "out of system resource" not in context["message"]:
             super().call_exception_handler(context)

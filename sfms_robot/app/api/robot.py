@@ -16,9 +16,10 @@ from typing import Final, Self
 from sfms_robot.app.api.servos import Background, Driven, head_name
 from sfms_robot.app.listen.knobs import LiveKnobs, RunControls
 from sfms_robot.app.open_head import prepare_head
-from sfms_robot.app.options import SIM, Report, RunOptions, record_format_named, words_of
+from sfms_robot.app.options import SIM, RunOptions, record_format_named, words_of
 from sfms_robot.app.session import run
 from sfms_robot.config import Calmness, Head, parse
+from sfms_robot.data import Report
 from sfms_robot.errors import ConfigError, InputError
 from sfms_robot.frames import FaceFrame, Floats, ListenerEvent
 from sfms_robot.listeners.engine import EngineName

@@ -9,7 +9,7 @@ from __future__ import annotations
 import atexit
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any, Final, Self
 
@@ -19,11 +19,12 @@ from numpy.typing import ArrayLike
 from sfms_robot.app.head.pose import NobodyThere
 from sfms_robot.app.listen.report import failure
 from sfms_robot.app.open_head import open_head
-from sfms_robot.app.options import SIM, HeadOptions, Report
+from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.config import Head, load_head
+from sfms_robot.data import Report
 from sfms_robot.errors import BusError, ConfigError, InputError, RobotError
-from sfms_robot.frames import POSE, Doubles, Floats, Reading
+from sfms_robot.frames import POSE, Doubles, Floats, Readings
 from sfms_robot.motion.limits import JointLimits
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
@@ -270,7 +271,7 @@ class Servos(Driven):
             self._running()
         return False
 
-    def read(self) -> Mapping[str, Reading]:
+    def read(self) -> Readings:
         """Return the newest reading of every joint. Before `enable` it polls the servos and blocks for that."""
         if self._run is None:
             return self._opened.bus.poll(self._opened.clock.now_s())

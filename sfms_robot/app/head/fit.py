@@ -18,7 +18,7 @@ import numpy as np
 
 from sfms_robot.app.head.pose import FaceTrack
 from sfms_robot.app.listen.report import failure
-from sfms_robot.app.options import SIM, HeadOptions, Report
+from sfms_robot.app.options import SIM, HeadOptions
 from sfms_robot.app.replay.run_file import RunRecording, read_recording
 from sfms_robot.app.session import Panel
 from sfms_robot.config import Head, load_head
@@ -33,6 +33,7 @@ from sfms_robot.config.overlay import (
     overlay_file,
     save_overlay,
 )
+from sfms_robot.data import Report
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.human import load_human
 from sfms_robot.frames import BLENDSHAPES, MOTION_DIM, SHAPES, Doubles, Floats

@@ -24,13 +24,12 @@ from sfms_robot.app.head.fit import Tracker, skin_motion
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.listen.report import limitation
 from sfms_robot.app.open_head import check_safety
-from sfms_robot.app.options import Report
 from sfms_robot.app.output_paths import INK, new_figure, plain, save
 from sfms_robot.app.progress import tracked
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.check import check_head, remarks
 from sfms_robot.config.head import drives
-from sfms_robot.data import data_dir, head_names
+from sfms_robot.data import Report, data_dir, head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_S, MOTION_DIM, POSE, POSE_CHANNELS, SHAPES, Doubles, Floats, clip_shapes
 from sfms_robot.motion.limits import JointLimits

@@ -21,7 +21,7 @@ from pydantic import BaseModel, RootModel
 from sfms_robot.app.output_paths import made_folder
 from sfms_robot.config import FirmwareMap, Head, load_firmware_map, map_files, parse
 from sfms_robot.config.base import read
-from sfms_robot.data import head_file
+from sfms_robot.data import Report, head_file
 from sfms_robot.errors import ConfigError
 
 LIMITS: Final = {"speed_deg_s": 150, "acceleration_deg_s2": 1500, "jerk_deg_s3": 90_000}  # of a slow neck
@@ -35,7 +35,7 @@ _CHANNELS: Final = {  # the words of a joint's name that stand for a channel; ax
 _PYPOT_MODELS: Final = {"ax-12": "ax-12a", "ax-18": "ax-18a"}  # by pypot's names; MX depend on the protocol
 _REACHY: Final = "reachy_mini"
 
-Plain = dict[str, Any]
+Plain = Report
 Draft = tuple[Plain, list[str]]  # the plain data of a head.yaml, and the remarks
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from sfms_robot.config import Head, load_head
-from sfms_robot.data import head_names
+from sfms_robot.data import Report, head_names
 from sfms_robot.face.robot_scene import RobotScene
 
 _CELL_PX: Final = (300, 290)
@@ -32,7 +32,7 @@ def main() -> None:
     page_child.main(lambda head, packages: scene_of(load_head(head, servos=False), packages))
 
 
-def draw_scene(name: str, png: Path, packages: Sequence[str] = ()) -> dict[str, Any]:
+def draw_scene(name: str, png: Path, packages: Sequence[str] = ()) -> Report:
     """Draw a head at rest; return its URDF, the joints that follow those of the head, and the meshes left out.
 
     `packages` as for `scene_of`. Raises ConfigError, MissingExtra.

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfms_robot.config import load_head
-from sfms_robot.data import head_file, head_names
+from sfms_robot.data import Report, head_file, head_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles
 from sfms_robot.retarget.head_retargeter import build_neck
@@ -22,7 +21,7 @@ _FARTHEST = 1e6  # rad or m: squares must not overflow
 log = logging.getLogger(__name__)
 
 
-def solve_poses(head_name: str, file: Path) -> dict[str, Any]:
+def solve_poses(head_name: str, file: Path) -> Report:
     """Solve every row of a CSV file, a pose that is held, for a head by name or folder.
 
     Returns the joints of the neck, and for each pose their angles [rad], whether it is reached, and what is missing.

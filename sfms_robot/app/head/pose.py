@@ -15,13 +15,13 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.app.listen.report import OUTCOME, failure
-from sfms_robot.app.options import HeadOptions, Report, RunOptions
+from sfms_robot.app.options import HeadOptions, RunOptions
 from sfms_robot.app.session import Panel, run
 from sfms_robot.config import Head, load_head
 from sfms_robot.config.base import read
-from sfms_robot.data import data_dir
+from sfms_robot.data import Report, data_dir
 from sfms_robot.errors import ConfigError, TorqueError
-from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, Doubles, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import CHANNEL_INDEX, NEUTRAL, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Facts, Observer, Source, Tick
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.clock import IDLE_FEED
@@ -48,7 +48,7 @@ def expressions() -> Mapping[str, Mapping[str, float]]:
 
 def parse_face(words: Sequence[str]) -> Floats:
     """Return motion (58,) of expressions and CHANNEL=VALUE; later words replace earlier ones. Raises ConfigError."""
-    motion = np.zeros(MOTION_DIM, np.float32)
+    motion = NEUTRAL.copy()
     for word in words:
         name, equals, text = word.partition("=")
         if not equals:

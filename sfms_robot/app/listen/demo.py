@@ -13,9 +13,9 @@ import numpy as np
 
 from sfms_robot.app import session
 from sfms_robot.app.listen.page_session import page_session
-from sfms_robot.app.options import Report, RunOptions, open_browser
+from sfms_robot.app.options import RunOptions, open_browser
 from sfms_robot.config import load_head
-from sfms_robot.data import speaker_names
+from sfms_robot.data import Report, speaker_names
 from sfms_robot.errors import MissingExtra
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.sources.registry import DEFAULT_SPEAKER

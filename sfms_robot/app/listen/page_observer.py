@@ -18,8 +18,9 @@ from sfms_robot.app.catalogue import shipped_listeners, shipped_speakers
 from sfms_robot.app.head.pose import expressions
 from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.listen.report import event_row
-from sfms_robot.app.options import Report, RunOptions
+from sfms_robot.app.options import RunOptions
 from sfms_robot.config import Calmness, Head, load_listener
+from sfms_robot.data import Report
 from sfms_robot.frames import CHANNELS, FRAME_HZ, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.events.model import load_tables
 from sfms_robot.plugins import listener_folder

@@ -17,19 +17,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-import numpy as np
-
 from sfms_robot.app import session
 from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.app.head.pose import expressions
 from sfms_robot.app.listen.knobs import RunControls
 from sfms_robot.app.listen.page_observer import PageObserver, PageRecorder, page_facts, people_per_minute
 from sfms_robot.app.listen.report import run_facts
-from sfms_robot.app.options import FEEDS, Report, RunOptions, words_of
+from sfms_robot.app.options import FEEDS, RunOptions, words_of
 from sfms_robot.config import load_head
-from sfms_robot.data import listener_names, speaker_names
+from sfms_robot.data import Report, listener_names, speaker_names
 from sfms_robot.errors import NOTE, InputError
-from sfms_robot.frames import MOTION_DIM
+from sfms_robot.frames import NEUTRAL
 from sfms_robot.listeners.remote import NamedFeed
 from sfms_robot.ports import Facts, Observer, Tick
 from sfms_robot.runtime.safety import Interrupt
@@ -162,7 +160,7 @@ class PageSession:
                 self.released = True
                 run.release()
             case "neutral":
-                run.puppet.show(np.zeros(MOTION_DIM, np.float32), values["seconds"])
+                run.puppet.show(NEUTRAL, values["seconds"])
             case "show":
                 run.puppet.show(values["channels"], values["seconds"])
             case "expression":

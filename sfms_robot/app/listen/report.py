@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Final
 import yaml
 
 from sfms_robot import __version__
-from sfms_robot.app.options import Report, RunOptions
+from sfms_robot.app.options import RunOptions
 from sfms_robot.config import Head, load_listener
+from sfms_robot.data import Names, Report
 from sfms_robot.errors import INTERRUPTED, BusError, ConfigError, ModelError, PortError, RobotError
 from sfms_robot.frames import EVENT_KINDS, ListenerEvent, SpeakerFrame
 from sfms_robot.listeners.space import MotionSpace
@@ -123,7 +124,7 @@ def _loop_figures(opened: OpenHead, log: RunLog, elapsed_s: float | None) -> Rep
     }
 
 
-def _counts(state: object, names: tuple[str, ...]) -> dict[str, int]:
+def _counts(state: object, names: Names) -> dict[str, int]:
     return {name: int(getattr(state, name)) for name in names if hasattr(state, name)}
 
 
@@ -194,7 +195,7 @@ class OutletObserver(EventWatch):
     def __init__(self, outlet: Outlet) -> None:
         super().__init__()
         self._outlet = outlet
-        self._state: tuple[str, tuple[str, ...]] | None = None
+        self._state: tuple[str, Names] | None = None
         for kind in EVENT_KINDS:
             self.on(kind, self._event)
 

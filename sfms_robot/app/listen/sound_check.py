@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.text import Text
 
 from sfms_robot.app.listen.panel import level_bar
-from sfms_robot.app.options import Report
+from sfms_robot.data import Report
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_S, Floats
 from sfms_robot.signals.audio import energy_db

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from sfms_robot.app.output_paths import FAINT, INK, checked_png, new_figure, pla
 from sfms_robot.app.progress import tracked
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
 from sfms_robot.config import load_head
+from sfms_robot.data import Report
 from sfms_robot.errors import ConfigError
 from sfms_robot.face import drawing
 from sfms_robot.face.human import load_human
@@ -90,7 +91,7 @@ _LABELS: Final = (
 _SEEN_ONLY: Final = ("jaw open", "tilt")  # these are named where they are seen, and get no picture of their own
 
 
-def replay_run(folder: Path, plot_png: Path | None, sheet_png: Path | None) -> dict[str, Any]:
+def replay_run(folder: Path, plot_png: Path | None, sheet_png: Path | None) -> Report:
     """Draw the pictures that are wanted; return a summary of the recording. Raises ConfigError, MissingExtra."""
     pictures = (plot_png, "--plot", plot), (sheet_png, "--sheet", sheet)
     wanted = [(checked_png(png, option), draw) for png, option, draw in pictures if png is not None]

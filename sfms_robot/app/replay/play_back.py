@@ -19,10 +19,11 @@ from sfms_robot.app.listen.knobs import turned
 from sfms_robot.app.listen.page_observer import page_facts
 from sfms_robot.app.listen.page_session import stay_for_visitors
 from sfms_robot.app.listen.report import OUTCOME
-from sfms_robot.app.options import SIM, HeadOptions, Report, RunOptions
+from sfms_robot.app.options import SIM, HeadOptions, RunOptions
 from sfms_robot.app.replay.run_file import RunRecording, read_recording, summary
 from sfms_robot.app.session import Panel
 from sfms_robot.config import load_head
+from sfms_robot.data import Report
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
 from sfms_robot.signals.audio import energy_db

@@ -19,7 +19,7 @@ from mcap.records import Channel, Footer, Message, Metadata
 from mcap.stream_reader import StreamReader
 
 from sfms_robot.app.listen.report import LONG
-from sfms_robot.app.options import Report
+from sfms_robot.data import Names, Report
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES, MOTION_DIM, Bools, Doubles, Floats
@@ -57,7 +57,7 @@ class RunRecording:
     """
 
     about: Mapping[str, str]
-    joints: tuple[str, ...]
+    joints: Names
     times_s: Doubles
     motion: Floats
     goals_rad: Floats
@@ -69,7 +69,7 @@ class RunRecording:
     energy_db: Doubles
     speaker: Floats
     plans: int
-    states: Sequence[tuple[float, str, tuple[str, ...]]]
+    states: Sequence[tuple[float, str, Names]]
     events: Sequence[tuple[float, str]]
     hottest_C: float | None
     whole: bool
@@ -124,7 +124,7 @@ def read_recording(folder: Path | str) -> RunRecording:
         what = f"has no {RUN_FILE}" if Path(folder).is_dir() else "is no folder"
         raise ConfigError(f"{folder}: {what}: not what `sfms-robot run --record DIR` wrote")
     about: Mapping[str, str] = {}
-    joints: tuple[str, ...] = ()
+    joints: Names = ()
     rows, whole = _Rows(list), False
     try:
         for file in parts:
@@ -214,7 +214,7 @@ def _row(topic: str, body: Any, joints: Sequence[str]) -> Any:
     return None  # a plan: only counted
 
 
-def _arrays(rows: _Rows, about: Mapping[str, str], joints: tuple[str, ...], whole: bool) -> RunRecording:
+def _arrays(rows: _Rows, about: Mapping[str, str], joints: Names, whole: bool) -> RunRecording:
     """Return the rows of each topic as a recording. A cut may fall between the face and the joints of one tick."""
     times_s, moved = zip(*rows["/joints"][: len(rows["/face"])], strict=True)
     goals_rad, present_rad, ages_s, faults = np.moveaxis(np.stack(moved), 2, 0)

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sfms_robot.app.progress import bar
 from sfms_robot.app.serve.batch_process import Served
+from sfms_robot.data import Report
 from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
 from sfms_robot.errors import ConfigError, ModelError, PacketError, RobotError, optional
 from sfms_robot.frames import FRAME_S
@@ -31,6 +32,7 @@ from sfms_robot.listeners.remote import listen_key
 from sfms_robot.listeners.remote_messages import Join, Notice, parse_words, words_message
 from sfms_robot.listeners.stream_server import DEADLINE_S, Figures, report
 from sfms_robot.network import Router, check_name, check_zenoh, close_session, serve_session, session_config
+from sfms_robot.ports import Facts
 from sfms_robot.processes import Child, Ended, cores
 
 if TYPE_CHECKING:
@@ -133,7 +135,7 @@ class WorkerPool:
             worker.requests[number] = (client, reply)
         worker.child.send((None, message, number))
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the figures of all processes together (`stream_server.report`), from any thread but the pool's own."""
         number = next(self._numbers)
         with self._changed:
@@ -232,7 +234,7 @@ def serve(
     insecure: bool = False,
     metrics: str | None = None,
     processes: int | None = None,
-) -> dict[str, Any]:
+) -> Report:
     """Serve until `over` is set, and return the figures. Blocks until then.
 
     Args:
@@ -258,7 +260,7 @@ def serve(
         figures = None if metrics is None else stack.enter_context(closing(metrics_server(metrics)))
         session = serve_session(config)
         stack.callback(close_session, session)
-        now: dict[str, Any] = {
+        now: Report = {
             "congestion_control": zenoh.CongestionControl.DROP,
             "priority": zenoh.Priority.REAL_TIME,
             "express": True,

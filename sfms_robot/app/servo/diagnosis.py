@@ -13,16 +13,17 @@ from itertools import chain
 from shlex import quote
 from typing import Final, Literal, cast
 
-from sfms_robot.app.options import SIM, Report
+from sfms_robot.app.options import SIM
 from sfms_robot.app.servo.serial_line import FoundServo
 from sfms_robot.app.servo.single_servo import ServoState
 from sfms_robot.config import Faults
 from sfms_robot.config.firmware import user_maps
 from sfms_robot.config.wire_time import BITS, FRAMINGS, Way
+from sfms_robot.data import Report
 from sfms_robot.servo.discovery import Holder, SerialDevice, is_address
 from sfms_robot.servo.families import servo_families
 from sfms_robot.servo.policy import counts
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.registers import Table, consecutive
 from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradictions, limit_names
 
 Severity = Literal["error", "warning", "note"]
@@ -449,10 +450,4 @@ def grouped(findings: Iterable[Finding]) -> list[Finding]:
 
 def ids_text(ids: Sequence[int]) -> str:
     """Return ids as the servo commands take them: `1,5-9`."""
-    runs: list[list[int]] = []
-    for servo in sorted(set(ids)):
-        if runs and servo == runs[-1][-1] + 1:
-            runs[-1].append(servo)
-        else:
-            runs.append([servo])
-    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in runs)
+    return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in consecutive(ids))

@@ -13,7 +13,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from typing import Final, cast
 
-from sfms_robot.app.options import SIM, Report
+from sfms_robot.app.options import SIM
 from sfms_robot.app.progress import Progress, no_progress
 from sfms_robot.app.servo.diagnosis import (
     SEVERITIES,
@@ -46,6 +46,7 @@ from sfms_robot.app.servo.serial_line import (
 from sfms_robot.app.servo.single_servo import ServoState, read_all, scan
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.config.overlay import head_hash, layered, load_overlay, record_stored
+from sfms_robot.data import Report
 from sfms_robot.errors import BusError, ConfigError, PacketError, PortError, ServoError
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.boards import RateLimitedPort, board_for, board_problem

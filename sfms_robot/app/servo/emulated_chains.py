@@ -16,8 +16,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from sfms_robot.app.options import Report
 from sfms_robot.config import load_firmware_map, load_head
+from sfms_robot.data import Report
 from sfms_robot.emulator.faults import parse_ids
 from sfms_robot.emulator.launch import BehindSilent, Chain, EmulatedServo, Timing, launch, wait
 from sfms_robot.endpoint import whole_number

@@ -8,9 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from sfms_robot.config import FirmwareMap, load, map_files
+from sfms_robot.data import Report
 from sfms_robot.errors import ConfigError
 
 
@@ -36,7 +37,7 @@ def check_maps(more: Iterable[Path]) -> list[MapProblem]:
     return [*findings, *_names(loaded), *_references(loaded), *_collisions(loaded)]
 
 
-def list_maps(more: Iterable[Path] = ()) -> list[dict[str, Any]]:
+def list_maps(more: Iterable[Path] = ()) -> list[Report]:
     """Return one row per model for `servo maps`. Raises ConfigError for a map that does not load."""
     rows = []
     for each in (load(FirmwareMap, file) for file in [*map_files(), *_expand(more)]):

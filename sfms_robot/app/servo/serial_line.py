@@ -13,10 +13,11 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from shlex import quote
-from typing import Any, Final
+from typing import Final
 
 from sfms_robot.app.options import SIM
 from sfms_robot.config import load_firmware_map, load_head, map_files, variant
+from sfms_robot.data import Report
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError, ConfigError, PortError, ServoError
 from sfms_robot.runtime.clock import RealClock
@@ -27,7 +28,7 @@ from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Field, Table
 
 Confirm = Callable[[str], bool]
-Row = dict[str, Any]  # of a table, and of --json
+Row = Report  # of a table, and of --json
 
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms, an emulator is late on a busy computer
 TRIES: Final = 3

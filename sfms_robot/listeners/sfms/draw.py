@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.config import NodCourse, SmileCourse
-from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats
+from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats, Ints
 from sfms_robot.listeners.engine import Engine
 from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals.control import COLUMNS, FULL_SIZE, since_s
 
-Tokens = NDArray[np.int64]
+Tokens = Ints
 A = TypeVar("A")  # an array or a tensor
 
 UNDECIDED: Final = -1

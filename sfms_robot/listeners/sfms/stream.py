@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.frames import (
@@ -27,6 +26,7 @@ from sfms_robot.frames import (
     Bools,
     Doubles,
     Floats,
+    Ints,
     Plan,
     SpeakerFrame,
     changed,
@@ -246,7 +246,7 @@ class SfmsListener(RunsOnEngine):
             found.append((self.space.plan(at_s, motion[row]), after))
         return found
 
-    def with_sway(self, shown: Floats, sway: Doubles, first: int | NDArray[np.int64]) -> Floats:
+    def with_sway(self, shown: Floats, sway: Doubles, first: int | Ints) -> Floats:
         """Return motion in the model's space of standardised motion (..., N, C), with the slow motion of the head.
 
         Args:
@@ -304,7 +304,7 @@ class SfmsListener(RunsOnEngine):
             one, seen = self._taken_in(states[:1])
             return [*one] * len(states), seen
         counts = [len(state.sounds) for state in states]
-        ends: NDArray[np.int64] = np.cumsum(counts, dtype=np.int64)
+        ends: Ints = np.cumsum(counts, dtype=np.int64)
         rows, phase, audio = self.frontend.step_each(
             [state.sounds for state in states], [state.audio for state in states]
         )

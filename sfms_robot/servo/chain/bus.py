@@ -19,17 +19,17 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from threading import RLock
-from typing import Any, ClassVar, Final
+from typing import ClassVar, Final
 
 import numpy as np
 
 from sfms_robot.config import BusConfig, Faults
 from sfms_robot.errors import BusError, PacketError
-from sfms_robot.frames import Doubles, Indices, Ints, Reading
-from sfms_robot.ports import STOP_S, StopPolicy, TickConversion
+from sfms_robot.frames import Doubles, Indices, Ints, Readings
+from sfms_robot.ports import STOP_S, Facts, StopPolicy, TickConversion
 from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.chain.link import AWAY_LATE_S, TRIES, RegisterLink, finish
 from sfms_robot.servo.chain.member import Member, Notices
@@ -403,7 +403,7 @@ class ChainBus(WireBus[RegisterLink]):
         if self._places.tolist() != places:
             self._places = np.array(places, np.intp)
 
-    def statistics(self) -> Mapping[str, Any]:
+    def statistics(self) -> Facts:
         """Return the counters of the report."""
         return {
             **self._counts,
@@ -415,7 +415,7 @@ class ChainBus(WireBus[RegisterLink]):
             "supply_peak_mA": round(self._peak_mA, 1),
         }
 
-    def poll(self, now_s: float) -> Mapping[str, Reading]:
+    def poll(self, now_s: float) -> Readings:
         """Read the position of all servos that are not silent, more of some, and probe or start up others.
 
         Blocks for `StatusPoll.budget_s` at most. Raises BusError if no servo has answered for so long that the bus has
@@ -442,7 +442,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._update_places()
         return answered
 
-    def _readings(self, now_s: float) -> Mapping[str, Reading]:
+    def _readings(self, now_s: float) -> Readings:
         """Return the readings; ages are by the port's clock, whatever the origin of `now_s`."""
         stamp_s = self._stamp_s if self._link is not None else self._now_s()
         for index in self._arrived:

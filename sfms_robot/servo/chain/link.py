@@ -58,6 +58,9 @@ class Answer(NamedTuple):
     data: bytes
 
 
+Answers = dict[int, Answer]  # by id
+
+
 class RegisterLink(ABC):
     """A wire of servos that have registers. Raises BusError if the port is gone, never for a silent servo.
 
@@ -101,7 +104,7 @@ class RegisterLink(ABC):
         """Read `length` bytes of one servo."""
 
     @abstractmethod
-    def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
+    def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> Answers:
         """Read `length` bytes of several servos by one request; return the answers by id, of those that answered.
 
         `fast`: all answer in one packet, which ends at the first silent servo (`has_fast_read`).

@@ -39,7 +39,7 @@ from typing import Final
 
 from sfms_robot.config import BusConfig
 from sfms_robot.config.wire_time import BITS, Framing, Way
-from sfms_robot.servo.chain.link import AWAY_LATE_S, Answer, RegisterLink
+from sfms_robot.servo.chain.link import AWAY_LATE_S, Answer, Answers, RegisterLink
 from sfms_robot.servo.chain.member import Member
 from sfms_robot.servo.chain.telemetry import Block, Telemetry
 from sfms_robot.servo.codecs.dxl2 import ALERT
@@ -65,7 +65,7 @@ _TURNAROUND_S: Final = 0.0005  # host and servo, between a request and its answe
 class PollOutcome:
     """Answers to a read of all servos. `gaps`: ids where answers stopped; `missed`: ids that were passed over."""
 
-    answers: dict[int, Answer] = field(default_factory=dict)
+    answers: Answers = field(default_factory=dict)
     gaps: list[int] = field(default_factory=list)
     missed: list[int] = field(default_factory=list)
     judged: bool = False  # a request waited for the full silence
@@ -238,7 +238,7 @@ class StatusPoll:
                 return {}
             self._counts["reads"] += 1
             return self.link.read_many(*where, ids, self._fast and len(ids) > 1 and where == self._telemetry.block)
-        answers: dict[int, Answer] = {}
+        answers: Answers = {}
         for servo in ids:
             if not self.link.grants(purpose, self._bytes(1, where[1]), alone=True):
                 break

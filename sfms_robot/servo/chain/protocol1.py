@@ -16,20 +16,20 @@ Withholding goals keeps a limp one limp. They have no reboot, and report their f
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar, Final
 
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import PacketError, ServoError
 from sfms_robot.servo.chain.bus import ChainBus
-from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
+from sfms_robot.servo.chain.link import Answer, Answers, Found, RegisterLink, Silent, Steps
 from sfms_robot.servo.chain.sdk_packets import instruction1
 from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.codecs import protocol1
 from sfms_robot.servo.codecs.protocol1 import BROADCAST, MAX_FRAME, Frame, encode, maybe_frame, salvage
 from sfms_robot.servo.policy import torque_limit
 from sfms_robot.servo.port import Port
-from sfms_robot.servo.registers import Field
+from sfms_robot.servo.registers import Field, Values
 
 _OWED_S: Final = 1.0  # an answer that has not come by then never will
 _FENCES: Final = 2  # of a group at most: answers share one wire, so those behind cannot overtake
@@ -108,7 +108,7 @@ class Protocol1Link(RegisterLink):
 
     sync_packet = staticmethod(protocol1.encode_sync_write)
 
-    def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
+    def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> Answers:
         late = [servo for servo in servos if self._owes(servo, length)]
         closed: list[int] = []
         judged = False
@@ -147,12 +147,12 @@ class Protocol1Link(RegisterLink):
         self.send(self._packet(servo, *request))
         return servo in self._answers([servo], size)
 
-    def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
+    def _answers(self, servos: Sequence[int], length: int) -> Answers:
         """Return answers of `servos` with `length` bytes of data, or with a refusal and none.
 
         Waits until all are there, or no byte came for the silence beyond the time that the bytes take.
         """
-        buffer, answers, pending, echo = bytearray(), dict[int, Answer](), set(servos), self._sent
+        buffer, answers, pending, echo = bytearray(), Answers(), set(servos), self._sent
         self._echoed = False
         size = self.framing.answer + length
         for data in self._incoming(len(echo) + size, (len(servos) - 1) * size):
@@ -173,7 +173,7 @@ class Protocol1Link(RegisterLink):
             self._owed.setdefault(servo, {})[length] = self.port.now_s()
         return answers
 
-    def _take(self, frame: Frame, length: int, pending: set[int], answers: dict[int, Answer]) -> None:
+    def _take(self, frame: Frame, length: int, pending: set[int], answers: Answers) -> None:
         refused = frame.code & self.refusal_bits and not frame.params
         if frame.servo in pending and (len(frame.params) == length or refused):
             answers[frame.servo] = Answer(frame.code, frame.params)
@@ -262,13 +262,13 @@ class Protocol1Startup(Startup):
         self.recognise(Found(self.value(self.table["model_number"]), None))
         yield from ()
 
-    def _defaults(self, now: Mapping[str, int]) -> dict[str, int]:
+    def _defaults(self, now: Values) -> dict[str, int]:
         defaults, limit = {self._name("return_delay"): 0}, self.table.role("torque_limit")
         if limit is not None and "max_torque" in now:  # the EEPROM's; an earlier run may have left less in RAM
             defaults[limit.name] = now["max_torque"]
         return defaults
 
-    def _set(self, now: Mapping[str, int], name: str, target: int) -> Steps[bool]:
+    def _set(self, now: Values, name: str, target: int) -> Steps[bool]:
         """Write a register, but no torque limit of 0: that is a shutdown, and stays until torque is switched on."""
         if name == self._name("torque_limit") and not now[name]:
             return False

@@ -16,12 +16,12 @@ from sfms_robot.config import variant
 from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import NOTE, ConfigError
 from sfms_robot.servo.chain.bus import ChainBus
-from sfms_robot.servo.chain.link import Answer, Found, RegisterLink, Silent, Steps
+from sfms_robot.servo.chain.link import Answer, Answers, Found, RegisterLink, Silent, Steps
 from sfms_robot.servo.chain.sdk_packets import read2, sync_read2
 from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.port import Port
-from sfms_robot.servo.registers import Table
+from sfms_robot.servo.registers import Table, Values
 from sfms_robot.servo.stored_settings import contradictions
 
 log = logging.getLogger(__name__)
@@ -90,7 +90,7 @@ class Dynamixel2Link(RegisterLink):
 
     sync_packet = staticmethod(dxl2.encode_sync_write)
 
-    def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> dict[int, Answer]:
+    def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> Answers:
         longer = length + self._extra
         self.send(sync_read2(address, longer, tuple(servos), fast))
         answers = self._fast_answers(servos, longer) if fast else self._answers(servos, longer)
@@ -104,12 +104,12 @@ class Dynamixel2Link(RegisterLink):
 
     # --- inside -------------------------------------------------------------------------------------------------
 
-    def _answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
+    def _answers(self, servos: Sequence[int], length: int) -> Answers:
         """Return status packets of `servos` with `length` bytes of data, or with an error and none.
 
         Waits until all are there, or no byte came for the silence beyond the time that the bytes take.
         """
-        buffer, answers, pending = bytearray(), dict[int, Answer](), set(servos)
+        buffer, answers, pending = bytearray(), Answers(), set(servos)
         size = self.framing.answer + length
         for data in self._incoming(len(self._sent) + size, (len(servos) - 1) * size):
             buffer += data
@@ -123,7 +123,7 @@ class Dynamixel2Link(RegisterLink):
                 break
         return answers
 
-    def _fast_answers(self, servos: Sequence[int], length: int) -> dict[int, Answer]:
+    def _fast_answers(self, servos: Sequence[int], length: int) -> Answers:
         """Return the answers in one packet of all: FF FF FD 00 FE ... ERROR ID data CRC, ERROR ID data CRC, ..."""
         size = self.framing.answers(len(servos), length, fast=True)
         buffer, start = bytearray(), -1
@@ -181,7 +181,7 @@ class Dynamixel2Startup(Startup):
             raise Silent(self._about("does not answer to a ping"))
         self.recognise(found)
 
-    def _defaults(self, now: Mapping[str, int]) -> dict[str, int]:
+    def _defaults(self, now: Values) -> dict[str, int]:
         drive_mode = now.get("drive_mode", 0) & ~_TORQUE_ON_BY_GOAL
         defaults = {"drive_mode": drive_mode, self._name("return_delay"): 0, "bus_watchdog": 0}
         if "pwm_limit" in now:  # an earlier run may have left less

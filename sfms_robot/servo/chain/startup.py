@@ -30,7 +30,7 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import ClassVar, Final, NamedTuple
 
@@ -40,7 +40,7 @@ from sfms_robot.ports import TickConversion
 from sfms_robot.servo.bus import tick_ranges
 from sfms_robot.servo.chain.link import TRIES, Found, RegisterLink, Silent, Steps, finish, verified_write
 from sfms_robot.servo.policy import BusServo, torque_limit
-from sfms_robot.servo.registers import Field, Table, span_of
+from sfms_robot.servo.registers import Field, Table, Values, span_of
 from sfms_robot.servo.stored_settings import (
     JointNeeds,
     contradictions,
@@ -88,7 +88,7 @@ def way_inside(present: int, limits: tuple[int, int], turn_ticks: float) -> WayI
     return WayInside(goal, distance_deg, 2.0 * distance_deg / SPEED_DEG_S + _SLACK_S)
 
 
-def slow_profile(table: Table, drive_mode: int, distance_deg: float) -> Mapping[str, int]:
+def slow_profile(table: Table, drive_mode: int, distance_deg: float) -> Values:
     """Return values by register name that move a servo at `SPEED_DEG_S`; empty for a model without a speed register.
 
     0 would mean no limit, so no value is less than 1.
@@ -144,7 +144,7 @@ class Startup(ABC):
         """Make the servo answer, and return the values of its registers, at least those up to present position."""
 
     @abstractmethod
-    def _defaults(self, now: Mapping[str, int]) -> dict[str, int]:
+    def _defaults(self, now: Values) -> dict[str, int]:
         """Return register values before torque, in any head; `now`: their values."""
 
     @abstractmethod
@@ -270,7 +270,7 @@ class Startup(ABC):
 
     # --- settings -----------------------------------------------------------------------------------------------
 
-    def wanted(self) -> Mapping[str, int]:
+    def wanted(self) -> Values:
         """Return registers and values that are to be in force while the bus runs.
 
         These are mode, profile, torque limit, and the registers of the head's file. Raises ServoError for a register
@@ -288,7 +288,7 @@ class Startup(ABC):
                 raise self._error(f"is a {table.model}, which has no register {name}")
         return {**{name: value for name, value in wanted.items() if name in table.fields}, **safety.registers}
 
-    def _set(self, now: Mapping[str, int], name: str, target: int) -> Steps[bool]:
+    def _set(self, now: Values, name: str, target: int) -> Steps[bool]:
         """Write a register that holds another value; return whether it was written. `now`: their values.
 
         Raises ServoError for one of the EEPROM under torque.
@@ -315,7 +315,7 @@ class Startup(ABC):
         """Return the position limits stored in the servo, ticks; None if it has none or they do not count."""
         return self._limits({name: self.value(self.table[name]) for name in limit_names(self.table) or ()})
 
-    def _limits(self, values: Mapping[str, int]) -> tuple[int, int] | None:
+    def _limits(self, values: Values) -> tuple[int, int] | None:
         """Return `own_limits` of registers that have been read."""
         names = limit_names(self.table)
         if names is None or not limits_count(self.table, self._needs):
@@ -323,7 +323,7 @@ class Startup(ABC):
         low, high = (values[name] for name in names)
         return (low, high) if low < high else None
 
-    def _corrections(self, values: Mapping[str, int]) -> dict[str, int]:
+    def _corrections(self, values: Values) -> dict[str, int]:
         """Return the registers that startup corrects, warn of others. Raises ServoError for a contradiction."""
         servo = self.servo
         found = contradictions(values, self.table, self._needs)

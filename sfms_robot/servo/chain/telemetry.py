@@ -8,14 +8,14 @@ per turn) is each model's own. Every register has its own sign rule, and the ser
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import Doubles, Ints, Reading
+from sfms_robot.frames import Doubles, Ints, Reading, Readings
 from sfms_robot.ports import TickConversion
 from sfms_robot.servo.policy import tells_current
 from sfms_robot.servo.registers import Field, Table, span_of
@@ -151,7 +151,7 @@ class Telemetry:
 
     def readings(
         self, joints: Sequence[str], faults: Sequence[str | None], rejoined: set[int], now_s: float
-    ) -> Mapping[str, Reading]:
+    ) -> Readings:
         """Return the readings of all joints; `rejoined`: indices of those that came back in this poll."""
         angles = self._conversion.to_rad(self.ticks).tolist()
         ages = (now_s - self.seen_s).tolist()
