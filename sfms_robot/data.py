@@ -1,7 +1,9 @@
-"""Paths of the files that ship with the package, and of the user's own; types of plain data."""
+"""Paths of the package's files and the user's own; types of plain data; files that are written whole."""
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -82,3 +84,19 @@ def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
     choices, one = shipped_names(root, marker), kind.removesuffix("s")
     problem = f"{one} {name!r} is neither a shipped name nor a folder with a {marker} ({', '.join(choices)})"
     raise ConfigError(problem + did_you_mean(name, choices))
+
+
+def write_whole(file: Path, text: str) -> None:
+    """Write a file, its folder made, whole or not at all. Raises ConfigError."""
+    new = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with new.open("w", encoding="utf-8", newline="") as out:
+            out.write(text)
+            out.flush()
+            os.fsync(out.fileno())
+        new.replace(file)
+    except OSError as error:
+        with suppress(OSError):
+            new.unlink()
+        raise ConfigError(f"{file}: cannot be written: {error}") from error

@@ -229,6 +229,9 @@ class ListenerEvent:
         return None if self.origin_s is None else self.origin_s + self.start_s
 
 
+Events = tuple[ListenerEvent, ...]
+
+
 @dataclass(frozen=True)
 class Plan:
     """The next motion of our face. A newer plan replaces an older one from its first time on.
@@ -246,7 +249,7 @@ class Plan:
     times_s: Doubles
     frames: Floats
     jaw_rad: Floats | None = None
-    events: tuple[ListenerEvent, ...] = ()
+    events: Events = ()
     hazards_hz: Mapping[str, float] = field(default_factory=dict)
 
 

@@ -13,10 +13,11 @@ from typing import Any, Final, Literal, NamedTuple, Protocol
 import numpy as np
 
 from sfms_robot.data import Names
-from sfms_robot.frames import Doubles, Floats, Ints, ListenerEvent, Plan, Readings, Sighting, SpeakerFrame
+from sfms_robot.frames import Doubles, Events, Floats, Ints, Plan, Readings, Sighting, SpeakerFrame
 
 StopPolicy = Literal["release", "hold"]  # torque off, or torque kept on, once the rest pose is reached
 Facts = Mapping[str, Any]  # figures and states for a report, by name
+Document = Callable[[], Facts]  # those of this moment
 STOP_S: Final = 0.5  # that `Bus.stop` takes at most
 
 
@@ -315,7 +316,7 @@ class OutputFrame:
     time_s: float
     motion: Floats
     state: str = "starting"
-    events: tuple[ListenerEvent, ...] = ()
+    events: Events = ()
     goals_rad: Doubles = field(default_factory=lambda: np.zeros(0))
     joints: Names = ()
 

@@ -36,7 +36,7 @@ from sfms_robot.errors import NOTE, ConfigError, RobotError, TorqueError
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.network import session_config
 from sfms_robot.plugins import REMOTE, listener_folder
-from sfms_robot.ports import Facts, Observer, Output, PlanFeed, Source, Timeline
+from sfms_robot.ports import Document, Observer, Output, PlanFeed, Source, Timeline
 from sfms_robot.processes import realtime_priority
 from sfms_robot.retarget.spontaneous import HeadLife
 from sfms_robot.runtime.clock import InlineFeed
@@ -131,7 +131,7 @@ def run(
     observers: Sequence[Observer] = (),
     timeline: Timeline | None = None,
     controls: RunControls | None = None,
-    more: Callable[[], Facts] = dict,
+    more: Document = dict,
     signals: bool = True,
 ) -> Report:
     """Listen until the duration is over or the run is interrupted. Blocks until then, and returns the report.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from math import radians
@@ -18,7 +18,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.ports import Clock
 from sfms_robot.servo.discovery import AUTO, choose_ports, list_ports, parse_ports, stable_name
-from sfms_robot.servo.port import Port, SerialPort, VirtualTimePort, emulator_control
+from sfms_robot.servo.port import OpenPort, SerialPort, VirtualTimePort, emulator_control
 from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 
@@ -49,7 +49,7 @@ def open_wires(head: Head, port: str, fast: bool = False) -> Iterator[Opened]:
             yield {name: stack.enter_context(launch(servos, fast)) for name, servos in plugged_in(head).items()}
 
 
-def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> Callable[[], Port]:
+def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> OpenPort:
     """Return a function that opens the port of a bus, again after its device was unplugged. Raises PortError."""
     if isinstance(where, str):
         return partial(SerialPort, stable_name(where), bus.baud, clock, bus.rs485)

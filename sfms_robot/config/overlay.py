@@ -13,7 +13,6 @@ joint counts as not calibrated.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -29,7 +28,7 @@ from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
 from sfms_robot.config.head import NOT_SHARED, Head, load_head
 from sfms_robot.config.joint import Expression, Joint, Safety
-from sfms_robot.data import data_dir, head_file, user_dir
+from sfms_robot.data import data_dir, head_file, user_dir, write_whole
 from sfms_robot.errors import ConfigError
 from sfms_robot.ports import Facts
 
@@ -183,7 +182,7 @@ def load_overlay(head: Head, file: Path | None = None) -> Overlay:
 
 def check_writable(file: Path) -> Path:
     """Return the file of an overlay, its folder made. Raises ConfigError where it cannot be written, now not later."""
-    _replace(probe := file.with_name(f".{file.name}.try"), "")
+    write_whole(probe := file.with_name(f".{file.name}.try"), "")
     probe.unlink()
     return file
 
@@ -192,21 +191,7 @@ def save_overlay(overlay: Overlay, file: Path) -> None:
     """Write an overlay whole or not at all. Raises ConfigError."""
     plain = overlay.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
     text = "# Of one built head: written by `sfms-robot head calibrate`, `head fit` and `doctor --fix`.\n"
-    _replace(file, text + yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=120))
-
-
-def _replace(file: Path, text: str) -> None:
-    """Write a file whole or not at all. Raises ConfigError."""
-    new = file.with_name(f".{file.name}.{os.getpid()}")
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        with new.open("w", encoding="utf-8", newline="") as out:
-            out.write(text)
-            out.flush()
-            os.fsync(out.fileno())
-        new.replace(file)
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be written: {error}") from error
+    write_whole(file, text + yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=120))
 
 
 def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Identity | None] | None = None) -> Layered:
@@ -290,7 +275,7 @@ def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bo
             wanted = {key: head.safety_of(key) for key in head.joints}
             wanted[joint] = wanted[joint].replaced(stored=stored)
             if {key: edited.safety_of(key) for key in edited.joints} == wanted:
-                _replace(own.resolve(), text)
+                write_whole(own.resolve(), text)
                 return own
     save_overlay(load_overlay(head, file).recorded(head_hash(name), joint, stored), file)
     return file

@@ -20,7 +20,7 @@ Feetech memory table V3.6 and communication protocol manual.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import reduce
 from typing import Final
 
@@ -38,7 +38,7 @@ from sfms_robot.emulator.control_table import (
 from sfms_robot.emulator.emulated_wire import EmulatedServo
 from sfms_robot.emulator.plant import MotorCommand, Plant
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.registers import Field, Table, Values
 
 WATCHDOG_TICK_S: Final = 0.02
 _CHECK_S: Final = 0.1  # between two looks of the firmware at the load and the temperature of its motor
@@ -311,7 +311,7 @@ class RegisterServo(ABC):
     def _refusal(self, field: Field, value: int | None) -> int:
         """Return the error of a write to a register, 0 where it is taken. `value`: None for a part of the register."""
 
-    def _apply(self, wanted: Mapping[str, int]) -> None:
+    def _apply(self, wanted: Values) -> None:
         locked = self._get("lock") == 1
         for name, value in wanted.items():
             field = self.table[name]
@@ -345,7 +345,7 @@ class RegisterServo(ABC):
         end = field.address + field.size
         self._stored = self._stored[: field.address] + bytes(self._memory.raw[field.address : end]) + self._stored[end:]
 
-    def _stepped(self, wanted: Mapping[str, int]) -> float:
+    def _stepped(self, wanted: Values) -> float:
         """Return where the steps written so far lead in step mode, in shaft ticks."""
         start = self.drive.goal if self.drive is not None and self._mode is Mode.STEP else self.plant.position
         return start + wanted.get("goal_position", 0)

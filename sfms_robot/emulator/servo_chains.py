@@ -17,7 +17,7 @@ from sfms_robot.emulator.control_table import Mode
 from sfms_robot.emulator.emulated_wire import EmulatedDevice, EmulatedServo, Reply
 from sfms_robot.emulator.register_servo import RegisterServo
 from sfms_robot.servo.codecs import dxl2, protocol1
-from sfms_robot.servo.registers import Field, Table
+from sfms_robot.servo.registers import Field, Table, Values
 
 FAST_BULK_READ: Final = 0x9A
 _FAST_READS: Final = {dxl2.FAST_SYNC_READ, FAST_BULK_READ}
@@ -223,7 +223,7 @@ class Dynamixel2Servo(RegisterServo):
         # "Shutdown (63)": torque stays off until a reboot.
         return dxl2.ACCESS_ERROR if name == "torque_enable" and value and self._shut_down() else 0
 
-    def _apply(self, wanted: Mapping[str, int]) -> None:
+    def _apply(self, wanted: Values) -> None:
         if "bus_watchdog" in wanted:
             self._tripped = False
         super()._apply(wanted)

@@ -177,7 +177,7 @@ def fit_frame(samples: Floats | None) -> Floats | None:
     """
     if samples is None or not len(samples):
         return None
-    out = np.zeros(FRAME_SAMPLES, dtype=np.float32)
+    out = SILENCE.copy()
     out[: min(len(samples), FRAME_SAMPLES)] = samples[:FRAME_SAMPLES]
     return out
 

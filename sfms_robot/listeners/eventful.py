@@ -37,7 +37,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from sfms_robot.config import Calmness
-from sfms_robot.frames import Floats, ListenerEvent, Plan, SpeakerFrame, changed
+from sfms_robot.frames import Events, Floats, ListenerEvent, Plan, SpeakerFrame, changed
 from sfms_robot.listeners.engine import RunsOnEngine
 from sfms_robot.listeners.events.model import AT_PERSON, EventMemory, EventModel
 from sfms_robot.listeners.idle import IdleMotion, IdleStream
@@ -63,7 +63,7 @@ class EventfulMemory:
 
     when: EventMemory
     how: Any
-    news: tuple[ListenerEvent, ...] = ()
+    news: Events = ()
     gaze: tuple[GazeState, ...]
     idle: IdleStream | None = None
 

@@ -21,6 +21,8 @@ from torch.nn import functional as F
 from sfms_robot import config
 from sfms_robot.listeners.idle import BANDS, head_channels
 
+Tensors = tuple[Tensor, ...]
+
 
 @lru_cache(maxsize=32)
 @torch.inference_mode(False)  # the cached tensor serves training as well
@@ -247,14 +249,14 @@ class Modulation(nn.Module):
         with torch.no_grad():
             self.linear.bias.copy_(torch.tensor([float(kind != "s") for kind in kinds]).repeat_interleave(width))
 
-    def forward(self, condition: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, condition: Tensor) -> Tensors:
         """Return one vector (..., size) per letter, of a condition (..., D) that SiLU was applied to."""
-        parts: tuple[Tensor, ...] = self.linear(condition).chunk(self.parts, dim=-1)
+        parts: Tensors = self.linear(condition).chunk(self.parts, dim=-1)
         return parts
 
-    def of_tokens(self, condition: Tensor) -> tuple[Tensor, ...]:
+    def of_tokens(self, condition: Tensor) -> Tensors:
         """Return (N, 1, size) per letter of a condition (N, D), for all tokens of a sample."""
-        parts: tuple[Tensor, ...] = self.linear(condition)[:, None].chunk(self.parts, dim=-1)
+        parts: Tensors = self.linear(condition)[:, None].chunk(self.parts, dim=-1)
         return parts
 
 

@@ -51,9 +51,9 @@ from sfms_robot.frames import (
     FRAME_HZ,
     FRAME_SAMPLES,
     MOTION_DIM,
+    Events,
     FaceFrame,
     Floats,
-    ListenerEvent,
     Plan,
     SpeakerFrame,
 )
@@ -148,14 +148,14 @@ class SentPlan:
 class Decided:
     """The JSON of a plan: its events and those of plans before, and the hazards [1/s] by kind."""
 
-    events: tuple[ListenerEvent, ...]
+    events: Events
     hazards_hz: dict[str, float]
 
 
 _DECIDED: Final = TypeAdapter(Decided)
 
 
-def plan_message(sent: SentPlan, earlier: tuple[ListenerEvent, ...] = ()) -> bytes:
+def plan_message(sent: SentPlan, earlier: Events = ()) -> bytes:
     """Return a plan as bytes. `earlier`: events that plans before have brought."""
     plan = sent.plan
     decided = {"events": [asdict(event) for event in (*earlier, *plan.events)], "hazards_hz": dict(plan.hazards_hz)}

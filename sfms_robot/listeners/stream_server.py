@@ -30,7 +30,7 @@ import numpy as np
 from sfms_robot.config.base import parse
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import PacketError, RobotError
-from sfms_robot.frames import FRAME_S, NO_SOUND, ListenerEvent, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_S, NO_SOUND, Events, Plan, SpeakerFrame
 from sfms_robot.listeners.capacity import Capacity, step_each
 from sfms_robot.listeners.remote_messages import (
     OURS,
@@ -134,7 +134,7 @@ class _Stream:
     expected: int | None = None  # number of the next frame
     to_plan: int = 0  # steps until the next one that plans
     stepping: bool = False
-    events: deque[tuple[ListenerEvent, ...]] = field(default_factory=lambda: deque(maxlen=SENT_AGAIN))
+    events: deque[Events] = field(default_factory=lambda: deque(maxlen=SENT_AGAIN))
     calmness: Calmness | None = None
 
 

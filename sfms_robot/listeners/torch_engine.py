@@ -32,7 +32,7 @@ from sfms_robot.listeners.arig.networks import networks as arig_networks
 from sfms_robot.listeners.arig.stream import ArigListener
 from sfms_robot.listeners.checkpoint import WEIGHTS, Array, load_config, load_weights
 from sfms_robot.listeners.engine import FOLDER, FORMAT, MANIFEST, Device, RunsOnEngine, digest
-from sfms_robot.listeners.layers import Network
+from sfms_robot.listeners.layers import Network, Tensors
 from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.sfms.model import networks as sfms_networks
 from sfms_robot.listeners.sfms.stream import SfmsListener
@@ -123,7 +123,7 @@ class _NetworkBatch:
         self._network = network
         self._inputs = [torch.zeros((size, *each.shape[1:]), dtype=each.dtype, device=device) for each in like]
         self._graph: torch.cuda.CUDAGraph | None = None
-        self._outputs: tuple[Tensor, ...] = ()
+        self._outputs: Tensors = ()
         # Waiting for a blocking event leaves the core to the other processes of `serve`; copying to the CPU would spin.
         self._done = torch.Event(device, blocking=True) if device.type == "cuda" else None
         if pool is not None:
@@ -193,7 +193,7 @@ def torch_engine(model: SfmsModel | ArigModel, device: Device = "cpu") -> TorchE
     return BatchEngine(model, networks_of(model), torch.device(device))
 
 
-def _tensors(arrays: Iterable[Array]) -> tuple[Tensor, ...]:
+def _tensors(arrays: Iterable[Array]) -> Tensors:
     """Return arrays as tensors of the same memory; read-only ones, which torch does not know, are copied."""
     return tuple(torch.from_numpy(each if each.flags.writeable else each.copy()) for each in arrays)
 

@@ -15,7 +15,7 @@ from typing import Final
 
 from sfms_robot.data import Names, Report
 from sfms_robot.frames import NO_SOUND, Plan, SpeakerFrame
-from sfms_robot.ports import Facts, Observer, Tick
+from sfms_robot.ports import Document, Facts, Observer, Tick
 from sfms_robot.runtime.states import RUNNING, RunState
 from sfms_robot.signals.audio import energy_db
 
@@ -78,7 +78,7 @@ class RunStatus(Observer):
         self,
         joints: Sequence[str],
         facts: Facts,
-        figures: Callable[[], Facts] = dict,
+        figures: Document = dict,
     ) -> None:
         self._joints, self._facts, self._figures = tuple(joints), dict(facts), figures
         self._tick: Tick | None = None

@@ -22,7 +22,7 @@ import logging
 import math
 import queue
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
@@ -33,7 +33,7 @@ import numpy as np
 import orjson
 from mcap.writer import Writer
 
-from sfms_robot.data import Names, Report
+from sfms_robot.data import Names, Report, write_whole
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, CHANNELS, Floats, Plan, SpeakerFrame
 from sfms_robot.ports import Facts, Observer, Tick
@@ -356,15 +356,10 @@ def check_folder(folder: Path, overwrite: bool = False) -> None:
 
 def write_report(folder: Path, report: Facts) -> None:
     """Write DIR/report.json, whole or not at all. An error is logged: the report is printed in any case."""
-    part = folder / (REPORT_FILE + ".part")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        part.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-        part.replace(folder / REPORT_FILE)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink()
-        _log.error("--record %s: the report cannot be written: %s", folder, error.strerror or error)
+        write_whole(folder / REPORT_FILE, json.dumps(report, indent=2) + "\n")
+    except ConfigError as error:
+        _log.error("--record %s: the report cannot be written: %s", folder, error)
 
 
 def part_name(part: int) -> str:

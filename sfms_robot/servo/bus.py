@@ -20,7 +20,7 @@ from sfms_robot.frames import Doubles, Indices, Ints, Reading, Readings
 from sfms_robot.ports import STOP_S, Facts, StopPolicy, TickConversion
 from sfms_robot.ranges import Range
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import Port
+from sfms_robot.servo.port import OpenPort, Port
 
 
 class Link(Protocol):
@@ -132,7 +132,7 @@ class WireBus(ABC, Generic[L]):
         name: str,
         servos: Sequence[BusServo],
         conversion: TickConversion,
-        open_port: Callable[[], Port],
+        open_port: OpenPort,
         baud: int,
         read_deadline_s: float,
         config: BusConfig,

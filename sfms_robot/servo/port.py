@@ -23,7 +23,7 @@ import socket
 import sys
 import time
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -88,6 +88,9 @@ class Port(Protocol):
 
     def close(self) -> None:
         """Close the device. Idempotent."""
+
+
+OpenPort = Callable[[], Port]  # raises PortError
 
 
 @dataclass

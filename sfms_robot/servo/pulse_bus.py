@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from typing import Final
 
@@ -39,7 +39,7 @@ from sfms_robot.servo.boards import (
 )
 from sfms_robot.servo.bus import WireBus
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import Port
+from sfms_robot.servo.port import OpenPort
 
 log = logging.getLogger(__name__)
 
@@ -73,7 +73,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         name: str,
         servos: Sequence[BusServo],
         conversion: TickConversion,
-        open_port: Callable[[], Port],
+        open_port: OpenPort,
         baud: int,
         read_deadline_s: float,
         config: BusConfig,

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sfms_robot.data import archive_kind
 from sfms_robot.errors import ConfigError, InputError
-from sfms_robot.frames import AUDIO_HZ, NO_SOUND, Doubles, Floats
+from sfms_robot.frames import AUDIO_HZ, NO_SOUND, Doubles, Floats, Indices
 
 if TYPE_CHECKING:
     import soundfile
@@ -307,7 +307,7 @@ def at_positions(samples: Floats, positions: Doubles) -> Floats:
     """
     before = np.floor(positions)
     phases = np.rint((positions - before) * _PHASES).astype(np.intp)
-    around: NDArray[np.intp] = before.astype(np.intp)[:, None] + _AROUND
+    around: Indices = before.astype(np.intp)[:, None] + _AROUND
     known = (around >= 0) & (around < len(samples))
     taken = np.where(known, samples[np.clip(around, 0, len(samples) - 1)], np.float32(0))
     signal: Floats = np.einsum("mt,mt->m", _kernels()[phases], taken)

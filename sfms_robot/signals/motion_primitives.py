@@ -19,6 +19,9 @@ STEP: Final = 1e-3  # resolution on disk
 SPLITS: Final = ("train", "validation", "test")
 
 
+Pieces = tuple[Floats, ...]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Motions:
     """Primitives at 25 fps, each kind a tuple of arrays; blendshapes are differences from the person's neutral.
@@ -37,17 +40,17 @@ class Motions:
         faces: (N, 52) face of a person who talks, mouth left out.
     """
 
-    nods: tuple[Floats, ...]
-    shakes: tuple[Floats, ...]
-    sway: tuple[Floats, ...]
-    heads: tuple[Floats, ...]
-    blinks: tuple[Floats, ...]
-    gaps: tuple[Floats, ...]
-    smiles: tuple[Floats, ...]
-    brows: tuple[Floats, ...]
-    idle: tuple[Floats, ...]
-    talk: tuple[Floats, ...]
-    faces: tuple[Floats, ...]
+    nods: Pieces
+    shakes: Pieces
+    sway: Pieces
+    heads: Pieces
+    blinks: Pieces
+    gaps: Pieces
+    smiles: Pieces
+    brows: Pieces
+    idle: Pieces
+    talk: Pieces
+    faces: Pieces
 
 
 KINDS: Final = tuple(field.name for field in fields(Motions))

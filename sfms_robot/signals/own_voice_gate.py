@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfms_robot.errors import InputError
-from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, Doubles, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, NO_SOUND, Doubles, Floats
 from sfms_robot.signals.audio import energy_db, environment
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
 
@@ -242,7 +242,7 @@ class SpeechProbability:
 
     def __init__(self, gains: Sequence[float] = GAINS) -> None:
         self._networks = [_Network(gain) for gain in gains]
-        self._left: Floats = np.zeros(0, np.float32)
+        self._left: Floats = NO_SOUND
 
     def push(self, samples: Floats, noise: bool = False) -> list[float]:
         """Return the probability of each window of 512 samples that (n,) mono 16 kHz samples complete.

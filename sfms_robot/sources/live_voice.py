@@ -30,7 +30,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, NO_SOUND, Floats
+from sfms_robot.frames import AUDIO_HZ, FRAME_S, FRAME_SAMPLES, NO_SOUND, SILENCE, Floats
 from sfms_robot.ports import Facts
 from sfms_robot.signals.audio import HIGHEST_RATE_HZ, LOWEST_RATE_HZ, Downmix, finite
 
@@ -81,7 +81,7 @@ class SourcePart:
 
 def window(first: int, samples: Floats, begin: int) -> Floats:
     """Return the (640,) from place `begin` on, of `samples` that begin at place `first`; silence elsewhere."""
-    out = np.zeros(FRAME_SAMPLES, np.float32)
+    out = SILENCE.copy()
     start, end = max(first, begin), min(first + len(samples), begin + FRAME_SAMPLES)
     if start < end:
         out[start - begin : end - begin] = samples[start - first : end - first]
@@ -408,7 +408,7 @@ class LiveVoice(SourcePart):
             if index < self._wanted or index >= self._wanted + KEPT_FRAMES:
                 self._counts["late_samples"] += len(part)
             else:
-                frame = self._frames.setdefault(index, np.zeros(FRAME_SAMPLES, dtype=np.float32))
+                frame = self._frames.setdefault(index, SILENCE.copy())
                 frame[within : within + len(part)] = np.clip(part, -1.0, 1.0)
             if arrived_s is not None and within + len(part) == FRAME_SAMPLES:
                 assert self._zero_s is not None

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot.errors import ConfigError, InputError
-from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, NO_SOUND, FaceFrame, Floats, Reals, Sighting
+from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, MOTION_DIM, NO_SOUND, SILENCE, FaceFrame, Floats, Reals, Sighting
 from sfms_robot.ports import Facts, Voice
 from sfms_robot.signals.audio import Downmix, Resampler, check_scale, finite
 from sfms_robot.signals.face_units import beyond, motion_of
@@ -258,7 +258,7 @@ class PushedSpeech(SourcePart):
 
     def _frame(self, begin: int) -> Floats:
         """Return the (640,) from place `begin` on."""
-        frame = np.zeros(FRAME_SAMPLES, np.float32)
+        frame = SILENCE.copy()
         for place, piece in self._pieces:
             if place >= begin + FRAME_SAMPLES:
                 break

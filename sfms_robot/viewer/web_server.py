@@ -41,7 +41,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from sfms_robot.data import Report
 from sfms_robot.endpoint import LOOPBACK, address_text, host_problem, is_loopback, listen, origin_problem, port_number
 from sfms_robot.errors import ConfigError, InputError, RobotError
-from sfms_robot.ports import Facts
+from sfms_robot.ports import Document
 from sfms_robot.viewer.page_process import Address
 
 MOST_CONNECTIONS: Final = 32
@@ -60,8 +60,6 @@ _HEADERS: Final = {
     "cache-control": "no-cache",
 }
 _GZIP_LEVEL: Final = 6
-
-Document = Callable[[], Facts]
 
 
 # --- the access rules -----------------------------------------------------------------------------------------------

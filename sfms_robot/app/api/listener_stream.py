@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfms_robot.errors import InputError
-from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES, MOTION_DIM, NO_SOUND, FaceFrame, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.ports import Listener
 from sfms_robot.signals.audio import check_scale
@@ -84,7 +84,7 @@ class ListenerStream:
         """
         time_s = (self._frames + 1) / FRAME_HZ
         said = None if agent_audio is None else _checked("agent_audio", agent_audio)
-        heard = np.zeros(0, np.float32) if audio is None else _checked("audio", audio)
+        heard = NO_SOUND if audio is None else _checked("audio", audio)
         seen: FaceFrame | None = None
         if face is not None:
             motion = _checked("face", face.motion if isinstance(face, FaceFrame) else face)

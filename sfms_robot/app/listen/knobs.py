@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 from sfms_robot.app.options import RunOptions, values_by_name
 from sfms_robot.config import Calmness, Head, parse
 from sfms_robot.errors import InputError
-from sfms_robot.ports import Facts
+from sfms_robot.ports import Document, Facts
 from sfms_robot.retarget.channel_mapping import ChannelMapping, Knobs
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
@@ -130,7 +130,7 @@ class RunControls:
         self.puppet = Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
         self.calmness = options.calmness or Calmness()
         self.set_rates: Callable[[Calmness], None] | None = None
-        self.document: Callable[[], Facts] = dict
+        self.document: Document = dict
         self.visitor: PageVisitor | None = None
         self.speech: Spoken | None = None
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +24,7 @@ from sfms_robot.data import Report
 from sfms_robot.frames import CHANNELS, FRAME_HZ, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.events.model import load_tables
 from sfms_robot.plugins import listener_folder
-from sfms_robot.ports import Facts, Observer, Tick
+from sfms_robot.ports import Document, Observer, Tick
 from sfms_robot.runtime.loop import AWAY_S
 from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.runtime.recorder import RUN_FILE, Recorder
@@ -113,7 +113,7 @@ class PageObserver(Observer):
     """
 
     def __init__(self, page: PageProcess, joints: Sequence[str]) -> None:
-        self.document: Callable[[], Facts] | None = None
+        self.document: Document | None = None
         self._page, self._joints = page, tuple(joints)
         self._index = -1
         self._frame: SpeakerFrame | None = None

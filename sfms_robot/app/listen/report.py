@@ -23,7 +23,7 @@ from sfms_robot.errors import INTERRUPTED, BusError, ConfigError, ModelError, Po
 from sfms_robot.frames import EVENT_KINDS, ListenerEvent, SpeakerFrame
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.plugins import listener_folder
-from sfms_robot.ports import Facts, Outlet, PlanFeed, Source, Tick
+from sfms_robot.ports import Document, Outlet, PlanFeed, Source, Tick
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.planned_events import EventWatch
 
@@ -95,7 +95,7 @@ def figures_so_far(
     feed: PlanFeed,
     live: LiveKnobs,
     outputs: Outputs | None,
-    more: Callable[[], Facts],
+    more: Document,
 ) -> Report:
     """Return the figures of the report that are known while it runs, under the report's names. From any thread."""
     passed_s = log.listened_s + (1 + log.eased) * log.period_s

@@ -32,13 +32,13 @@ from sfms_robot.listeners.remote import listen_key
 from sfms_robot.listeners.remote_messages import Join, Notice, parse_words, words_message
 from sfms_robot.listeners.stream_server import DEADLINE_S, Figures, report
 from sfms_robot.network import Router, check_name, check_zenoh, close_session, serve_session, session_config
-from sfms_robot.ports import Facts
+from sfms_robot.ports import Document, Facts
 from sfms_robot.processes import Child, Ended, cores
 
 if TYPE_CHECKING:
     import zenoh
 
-    from sfms_robot.viewer.web_server import Document, LocalServer
+    from sfms_robot.viewer.web_server import LocalServer
 
 FIGURES_LIMIT_S: Final = 2.0  # for the figures of a process; later, its last ones count
 CLOSE_LIMIT_S: Final = 1.0

@@ -7,7 +7,7 @@ another rate, of another model or not in the file, and whether the bus reaches t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, replace
 from functools import partial
@@ -54,7 +54,7 @@ from sfms_robot.servo.chain.protocol2 import Dynamixel2Link
 from sfms_robot.servo.chain.startup import needs_of
 from sfms_robot.servo.discovery import SerialDevice, access_problem, describe, group_of, holders, list_ports, rivals
 from sfms_robot.servo.families import family_named
-from sfms_robot.servo.port import Port, SerialPort
+from sfms_robot.servo.port import OpenPort, SerialPort
 from sfms_robot.servo.registers import Table, span_of
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
@@ -63,8 +63,6 @@ DEFAULT_FAMILY: Final = "dynamixel2"
 _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still waits for the next USB frame
 _BOARD_S: Final = 0.2  # a board answers at once; 9600 baud and a USB adapter take the rest
 _READ: Final = ("present_position", "present_speed", "present_load", "present_current")
-
-OpenPort = Callable[[], Port]  # raises PortError
 
 
 def examine(

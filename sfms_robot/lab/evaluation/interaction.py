@@ -13,7 +13,7 @@ from sfms_robot import config
 from sfms_robot.app.progress import tracked
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, Bools, Doubles, Floats
+from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, NO_SOUND, Bools, Doubles, Floats
 from sfms_robot.lab import Figures
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
@@ -184,7 +184,7 @@ def border_ratio(motions: Sequence[Floats], period: int) -> float:
 
 def listening_again(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> float:
     """Return the mean jaw opening a second and more after the agent's own voice over that during it."""
-    speaking, after = [np.zeros(0, np.float32)], [np.zeros(0, np.float32)]
+    speaking, after = [NO_SOUND], [NO_SOUND]
     for one, dyad in zip(motions, dyads, strict=True):
         if dyad.agent_audio is None:
             continue

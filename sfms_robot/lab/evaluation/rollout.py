@@ -26,7 +26,16 @@ from torch import Tensor
 from sfms_robot.app.progress import tracked
 from sfms_robot.config.listener import paper_state
 from sfms_robot.errors import ConfigError
-from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, MOTION_DIM, FaceFrame, Floats, ListenerEvent, SpeakerFrame
+from sfms_robot.frames import (
+    FRAME_S,
+    FRAME_SAMPLES,
+    MOTION_DIM,
+    NO_SOUND,
+    FaceFrame,
+    Floats,
+    ListenerEvent,
+    SpeakerFrame,
+)
 from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.collection import Order, usable
 from sfms_robot.lab.corpora.conversational_states import UNKNOWN
@@ -108,7 +117,7 @@ def speaker_frames(
     A face of NaN becomes None, and so does the attention (N,) of a frame without a face; an attention of NaN (unknown)
     stays. Without any sound there is no microphone.
     """
-    heard = audio if audio is not None and audio.any() else np.zeros(0, np.float32)
+    heard = audio if audio is not None and audio.any() else NO_SOUND
     said = None if agent_audio is None else np.pad(agent_audio, (0, FRAME_SAMPLES))[FRAME_SAMPLES:]
     shown = np.asarray(np.isfinite(face).all(axis=1))
     frames = []

@@ -26,6 +26,7 @@ from sfms_robot.listeners.layers import (
     CrossAttention,
     FeedForward,
     Modulation,
+    Tensors,
     attention,
     join_heads,
     mlp,
@@ -60,12 +61,12 @@ class TrackSide(nn.Module):
         self.out = nn.Linear(width, width)
         self.ffn = FeedForward(width, hidden)
 
-    def ask(self, x: Tensor, condition: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+    def ask(self, x: Tensor, condition: Tensor) -> tuple[Tensor, Tensors]:
         """Return queries, keys and values (N, c, 3D) of x (N, c, D), and the modulation by a condition (N, D)."""
         parts = self.modulation.of_tokens(condition)
         return self.qkv(modulated(x, parts[0], parts[1])), parts
 
-    def answer(self, x: Tensor, seen: Tensor, parts: tuple[Tensor, ...]) -> Tensor:
+    def answer(self, x: Tensor, seen: Tensor, parts: Tensors) -> Tensor:
         """Return (N, c, D) of x (N, c, D) and the attention (N, c, D) of its queries."""
         # adaLN (A.1): gates of the attention and of the feed-forward, both modulated by the newest sound of the track.
         x = torch.addcmul(x, parts[2], self.out(seen))

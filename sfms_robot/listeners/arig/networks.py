@@ -14,13 +14,13 @@ import torch
 from torch import Tensor, nn
 
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.layers import Network
+from sfms_robot.listeners.layers import Network, Tensors
 
 
 class RestNetwork(Network[ArigModel]):
     """A still face and silence as the memory of a stream: called once, when a listener is loaded."""
 
-    def forward(self, still: Tensor) -> tuple[Tensor, ...]:
+    def forward(self, still: Tensor) -> Tensors:
         """Return embedded motion and silence (1, D), and the keys of each (1, 2D), of still (1, C) standardised."""
         progress, motion, silence = self.model.progress, self.model.embed_own(still), self.model.no_agent_sound[None]
         return motion, silence + 0.0, progress.temporal.keys(motion), progress.coarse.keys(silence)
@@ -54,7 +54,7 @@ class FrameNetwork(Network[ArigModel]):
         sample: Tensor,
         rows: Tensor,
         *past: Tensor,
-    ) -> tuple[Tensor, ...]:
+    ) -> Tensors:
         """Take one frame, equation (2).
 
         Args:
@@ -104,7 +104,7 @@ class DrawNetwork(Network[ArigModel]):
         motion_keys: Tensor,
         rows: Tensor | None = None,
         speaks: Tensor | None = None,
-    ) -> tuple[Tensor, ...]:
+    ) -> Tensors:
         """Draw one frame.
 
         Args:

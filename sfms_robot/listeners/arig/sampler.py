@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sfms_robot import config
-from sfms_robot.listeners.layers import Modulation, mlp, modulated, sinusoidal, weighted_mean
+from sfms_robot.listeners.layers import Modulation, Tensors, mlp, modulated, sinusoidal, weighted_mean
 from sfms_robot.listeners.sfms.quantizer import Grid
 
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
@@ -78,9 +78,9 @@ class Denoiser(nn.Module):
         out: Tensor = self.time(self.places[t])
         return out
 
-    def modulate(self, z: Tensor, level: Tensor) -> tuple[Tensor, ...]:
+    def modulate(self, z: Tensor, level: Tensor) -> Tensors:
         """Return shift, scale and gate of every block, (N, W) each, of z (N, D) and level embeddings (N, W)."""
-        parts: tuple[Tensor, ...] = self.modulation(F.silu(self.condition(z) + level))
+        parts: Tensors = self.modulation(F.silu(self.condition(z) + level))
         return parts
 
     def forward(self, noisy: Tensor, parts: Parts) -> Tensor:

@@ -30,6 +30,7 @@ from sfms_robot.frames import (
     FRAME_S,
     SMILE_CORNERS,
     Doubles,
+    Events,
     FaceFrame,
     Floats,
     ListenerEvent,
@@ -215,7 +216,7 @@ def begun_before(events: Sequence[ListenerEvent], now_s: float) -> list[Listener
     ]
 
 
-def remembered(events: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
+def remembered(events: Sequence[ListenerEvent], now_s: float) -> Events:
     """Return the events, in order, that may still matter: those of the last minute, of every kind the newest."""
     newest = {event.kind: event for event in events}
     return tuple(event for event in events if newest[event.kind] is event or event.end_s > now_s - REMEMBERED_S)

@@ -31,7 +31,7 @@ from pydantic import Field
 from sfms_robot.config import Calmness, Model, load
 from sfms_robot.config.base import Finite, NonNegative, Positive
 from sfms_robot.data import data_dir
-from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, ListenerEvent, SpeakerFrame, changed
+from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, Events, ListenerEvent, SpeakerFrame, changed
 from sfms_robot.listeners.events.evidence import (
     AT,
     EVIDENCE,
@@ -197,7 +197,6 @@ EXCLUDES: Final[Mapping[str, frozenset[str]]] = {
 
 
 _NEVER: Final[Mapping[str, float]] = dict.fromkeys(EVENT_KINDS, 0.0)
-Decided = tuple[ListenerEvent, ...]  # with one frame: most have none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -215,7 +214,7 @@ class EventMemory:
     sensed: SenseMemory
     seed: int
     calmness: Calmness
-    done: tuple[ListenerEvent, ...] = ()
+    done: Events = ()
     hazards_hz: Mapping[str, float] = field(default_factory=lambda: _NEVER)
 
 
@@ -244,7 +243,7 @@ class EventModel:
 
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventMemory]
-    ) -> list[tuple[Decided, EventMemory]]:
+    ) -> list[tuple[Events, EventMemory]]:
         """Take a frame of 40 ms of each stream; return what it decides, and the memory after it. Pure."""
         sensed = [sense(speaker, memory.sensed) for speaker, memory in zip(speakers, memories, strict=True)]
         decided = self.decide_each([one for one, _ in sensed], memories)
@@ -255,13 +254,13 @@ class EventModel:
         sensed: Sequence[Sensed],
         memories: Sequence[EventMemory],
         histories: Sequence[Sequence[ListenerEvent]] | None = None,
-    ) -> list[tuple[Decided, EventMemory]]:
+    ) -> list[tuple[Events, EventMemory]]:
         """Draw the hazards of several streams, all of them together: the second half of `step_each`.
 
         `histories` replace the streams' own events; events that have not begun by now do not count. A gaze shift away
         is followed by one back when its time is over.
         """
-        found: list[tuple[Decided, EventMemory]] = [((), memory) for memory in memories]
+        found: list[tuple[Events, EventMemory]] = [((), memory) for memory in memories]
         rows = [row for row, one in enumerate(sensed) if one.frame % STEP_FRAMES == STEP_FRAMES - 1]
         if rows:
             known = [memory.done for memory in memories]
@@ -279,7 +278,7 @@ class EventModel:
 
     def _drawn(
         self, sensed: Sensed, memory: EventMemory, history: Sequence[ListenerEvent], log_odds: Doubles, terms: Doubles
-    ) -> tuple[Decided, EventMemory]:
+    ) -> tuple[Events, EventMemory]:
         """Return the events that are drawn, of log-odds (H,) as learned, and their terms (T,)."""
         now_s = (sensed.frame + 1) * FRAME_S
         odds = [own + more for own, more in zip(log_odds.tolist(), self.asked_odds(memory.calmness), strict=True)]
@@ -314,7 +313,7 @@ class EventModel:
             for kind in self.bank.kinds
         ]
 
-    def _look_back(self, frame: int, history: Sequence[ListenerEvent], now_s: float) -> tuple[ListenerEvent, ...]:
+    def _look_back(self, frame: int, history: Sequence[ListenerEvent], now_s: float) -> Events:
         """Return the look back at the person, once looking away is over."""
         shift = last_shift(history)
         if shift is None or shift.target_rad in (None, AT_PERSON) or shift.end_s > _begin_s(frame) + 1e-9:

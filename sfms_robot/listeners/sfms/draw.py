@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sfms_robot import config
 from sfms_robot.config import NodCourse, SmileCourse
-from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats, Ints
+from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats, Indices, Ints
 from sfms_robot.listeners.engine import Engine
 from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals.control import COLUMNS, FULL_SIZE, since_s
@@ -294,7 +294,7 @@ class EventCourse:
             return smile_course(self.how, control) if control[..., _AT["smile.active"]].any() else None
         return nod_course(self.how, control) if control[..., _AT["nod.active"]].any() else None
 
-    def penalties(self, wanted: Doubles, spread: Doubles, last: Tokens) -> tuple[NDArray[np.intp], Floats]:
+    def penalties(self, wanted: Doubles, spread: Doubles, last: Tokens) -> tuple[Indices, Floats]:
         """Return which streams (S,) have a course in this frame, and the log-odds (S, V + 1) that each class loses.
 
         Args:

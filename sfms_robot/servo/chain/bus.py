@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from threading import RLock
 from typing import ClassVar, Final
@@ -38,7 +38,7 @@ from sfms_robot.servo.chain.settings import BUS_WATCHDOG, Settings
 from sfms_robot.servo.chain.startup import LONGEST_READ, PATIENCE_S, Startup, needs_of, start_up
 from sfms_robot.servo.chain.telemetry import Telemetry, raw_type
 from sfms_robot.servo.policy import BusServo
-from sfms_robot.servo.port import Port
+from sfms_robot.servo.port import OpenPort
 from sfms_robot.servo.registers import Field
 
 log = logging.getLogger(__name__)
@@ -78,7 +78,7 @@ class ChainBus(WireBus[RegisterLink]):
         name: str,
         servos: Sequence[BusServo],
         conversion: TickConversion,
-        open_port: Callable[[], Port],
+        open_port: OpenPort,
         baud: int,
         read_deadline_s: float,
         config: BusConfig,

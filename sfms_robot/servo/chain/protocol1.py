@@ -262,7 +262,7 @@ class Protocol1Startup(Startup):
         self.recognise(Found(self.value(self.table["model_number"]), None))
         yield from ()
 
-    def _defaults(self, now: Values) -> dict[str, int]:
+    def _defaults(self, now: Values) -> Values:
         defaults, limit = {self._name("return_delay"): 0}, self.table.role("torque_limit")
         if limit is not None and "max_torque" in now:  # the EEPROM's; an earlier run may have left less in RAM
             defaults[limit.name] = now["max_torque"]

@@ -181,7 +181,7 @@ class Dynamixel2Startup(Startup):
             raise Silent(self._about("does not answer to a ping"))
         self.recognise(found)
 
-    def _defaults(self, now: Values) -> dict[str, int]:
+    def _defaults(self, now: Values) -> Values:
         drive_mode = now.get("drive_mode", 0) & ~_TORQUE_ON_BY_GOAL
         defaults = {"drive_mode": drive_mode, self._name("return_delay"): 0, "bus_watchdog": 0}
         if "pwm_limit" in now:  # an earlier run may have left less

@@ -144,7 +144,7 @@ class Startup(ABC):
         """Make the servo answer, and return the values of its registers, at least those up to present position."""
 
     @abstractmethod
-    def _defaults(self, now: Values) -> dict[str, int]:
+    def _defaults(self, now: Values) -> Values:
         """Return register values before torque, in any head; `now`: their values."""
 
     @abstractmethod
@@ -323,7 +323,7 @@ class Startup(ABC):
         low, high = (values[name] for name in names)
         return (low, high) if low < high else None
 
-    def _corrections(self, values: Values) -> dict[str, int]:
+    def _corrections(self, values: Values) -> Values:
         """Return the registers that startup corrects, warn of others. Raises ServoError for a contradiction."""
         servo = self.servo
         found = contradictions(values, self.table, self._needs)
