@@ -68,13 +68,8 @@ FAULTS = (
     Fault(TIMELINE, "np.maximum(before[BLINKS], after[BLINKS])", "blend[BLINKS]", MOTION),
     Fault(TIMELINE, "delay_s = FRAME_S if len(times_s) == 1 else 0.0", "delay_s = 0.0", MOTION),
     Fault(TIMELINE, "b0 / 2,", "b0,", MOTION),
-    Fault(TIMELINE, "np.isfinite(frames).all() and", "", MOTION),
-    Fault(
-        TIMELINE,
-        "np.clip(frames[:, SHAPES], 0.0, 1.0)\n    frames[:, POSE]",
-        "frames[:, SHAPES]\n    frames[:, POSE]",
-        MOTION,
-    ),
+    Fault(TIMELINE, "numbers = (times_s, frames, ", "numbers = (times_s, ", MOTION),
+    Fault(TIMELINE, "    clip_shapes(frames)\n", "", MOTION),
     Fault(TIMELINE, "(1 - ease((asked_s - curve.made_at_s - STALL_S) / EASE_S))[:, None]", "1.0", MOTION),
     Fault(TIMELINE, "slopes[:kept], bends[:kept] = past.slopes[:kept], past.bends[:kept]", "pass", MOTION),
     # codecs

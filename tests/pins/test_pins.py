@@ -3,6 +3,7 @@
 import pins
 import pytest
 from ended import Ended
+from seeded_faults import FAULTS, ROOT
 
 FAILED = {"version", "exit", "error", "exit_code"}
 
@@ -48,3 +49,8 @@ def same(value, before):
 
 def test_figures_are_the_same():
     same(pins.figures(), pins.golden("figures"))
+
+
+def test_every_seeded_fault_can_still_be_made():
+    stale = [fault for fault in FAULTS if (ROOT / "sfms_robot" / fault.file).read_text().count(fault.old) != 1]
+    assert not stale, "where a line moves, its entry moves with it"
