@@ -125,16 +125,10 @@ def test_every_told_number_has_a_gradient_and_so_has_every_weight():
     assert len(told_weights) == 4 and all((weight.grad != 0).any() for weight in told_weights)
 
 
-@pytest.mark.parametrize(
-    "control, text",
-    [
-        (np.zeros((47, 36), np.float32), r"control has shape \(47, 36\), not \(48, 36\)"),
-        (np.zeros((48, 35), np.float32), r"control has shape \(48, 35\)"),
-    ],
-)
-def test_control_of_another_shape_is_refused(told, control, text):
-    with pytest.raises(ValueError, match=text):
-        told.step(speech(1)[0], told.start(1), control)
+@pytest.mark.parametrize("shape", [(47, 36), (48, 35)])
+def test_control_of_another_shape_is_refused(told, shape):
+    with pytest.raises(ValueError, match=rf"control has shape \({shape[0]}, {shape[1]}\), not \(48, 36\)"):
+        told.step(speech(1)[0], told.start(1), np.zeros(shape, np.float32))
 
 
 def test_one_that_is_not_told_takes_none(tiny):
