@@ -19,9 +19,9 @@ from typing import Any, Final, Protocol
 
 import orjson
 
+from sfms_robot.data import Report
 from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError, PortError, RobotError
-from sfms_robot.ports import Facts
 from sfms_robot.processes import LIMITS, Child, Ended, Supervised
 
 START_LIMIT_S: Final = 30.0  # importing on a small board with a cold disk
@@ -62,7 +62,7 @@ class Address:
 class Asked(Protocol):
     """The receiver of visitors' commands. Called in a thread of the page's; a RobotError is sent to the visitor."""
 
-    def command(self, visitor: int, name: str, values: Facts) -> None:
+    def command(self, visitor: int, name: str, values: Report) -> None:
         """Do what a visitor with the controls wants."""
 
     def person(self, visitor: int, message: bytes) -> None:
@@ -135,7 +135,7 @@ class PageProcess:
         """Return whether it has given no sign of life for a while; see `watch`."""
         return self._supervised.hung
 
-    def statistics(self) -> Facts:
+    def statistics(self) -> Report:
         """Return for status and report: whether it hangs now, and how often it has."""
         return {"hung": self.hung, "hangs": self._supervised.hangs}
 

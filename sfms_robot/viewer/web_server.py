@@ -25,7 +25,7 @@ import ssl
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import orjson
 import uvicorn
@@ -41,8 +41,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from sfms_robot.data import Report
 from sfms_robot.endpoint import LOOPBACK, address_text, host_problem, is_loopback, listen, origin_problem, port_number
 from sfms_robot.errors import ConfigError, InputError, RobotError
-from sfms_robot.ports import Document
 from sfms_robot.viewer.page_process import Address
+
+if TYPE_CHECKING:  # numpy with it, and a port in use is to be said at once
+    from sfms_robot.ports import Document
 
 MOST_CONNECTIONS: Final = 32
 CONNECTION_S: Final = 10.0

@@ -123,8 +123,8 @@ ARROWS = [  # how its head is set, what happens, where it is then, the fault it 
     (pinch("limp"), [("overloads",), ("silent", 1.0), ("take_torque", False, 4.0), ("run", 4.0)], REJOINING, None),
     ({}, [("take_torque", False, 0.0)], RETURNING, "torque lost"),
     ({"on_fault": "hold"}, [("fails",), ("take_torque", False, 0.1)], LIMP, "overload"),  # its own protection
-    ({}, [("distrust", "watchdog", 0.0)], RETURNING, "watchdog"),
-    ({}, [("distrust", "watchdog", 0.0), ("run", 0.0)], REJOINING, None),
+    ({}, [("distrust", 0.0)], RETURNING, "watchdog"),
+    ({}, [("distrust", 0.0), ("run", 0.0)], REJOINING, None),
     ({}, [("gone",)], SILENT, "no answer"),  # the port
     ({"on_fault": "limp"}, [("fails",), ("gone",)], LIMP, "overload"),
     ({"on_fault": "hold"}, [("fails",), ("gone",)], FAULTY, "overload"),

@@ -35,11 +35,10 @@ _CHANNELS: Final = {  # the words of a joint's name that stand for a channel; ax
 _PYPOT_MODELS: Final = {"ax-12": "ax-12a", "ax-18": "ax-18a"}  # by pypot's names; MX depend on the protocol
 _REACHY: Final = "reachy_mini"
 
-Plain = Report
-Draft = tuple[Plain, list[str]]  # the plain data of a head.yaml, and the remarks
+Draft = tuple[Report, list[str]]  # the plain data of a head.yaml, and the remarks
 
 
-def import_head(file: Path, folder: Path | None = None, model: str | None = None) -> Plain:
+def import_head(file: Path, folder: Path | None = None, model: str | None = None) -> Report:
     """Write a head folder from the file of another program. The servos are neither asked nor moved.
 
     Returns the folder, what the file was `read_as`, the joints, and `remarks`: what was left out, assumed or has to be
@@ -169,8 +168,8 @@ class PypotRobot(BaseModel):
 def _from_pypot(raw: Any, file: Path, name: str, model: str | None) -> Draft:
     robot = parse(PypotRobot, raw, file)
     remarks: list[str] = []
-    buses: Plain = {}
-    joints: Plain = {}
+    buses: Report = {}
+    joints: Report = {}
     attached: set[str] = set()
     for title, controller in robot.controllers.items():
         bus = _name(title, remarks)
@@ -286,7 +285,7 @@ def _from_reachy(raw: Any, file: Path, name: str, model: str | None) -> Draft:
 # --- What the formats share -----------------------------------------------------------------------------------------
 
 
-def _joint(servo: int, table: FirmwareMap, zero: int, sign: int, ticks: tuple[int, int]) -> Plain:
+def _joint(servo: int, table: FirmwareMap, zero: int, sign: int, ticks: tuple[int, int]) -> Report:
     """Return the place, direction and range of a joint; it rests at zero, or at the end of its range next to it."""
     low, high = (sign * (tick - zero) * 360 / table.ticks_per_revolution for tick in ticks[::sign])
     joint = {"id": servo, "model": table.model, "zero_ticks": zero, "min_deg": round(low, 2), "max_deg": round(high, 2)}
@@ -305,7 +304,7 @@ def _name(given: str, remarks: list[str]) -> str:
     return name
 
 
-def _finished(name: str, description: str, buses: Plain, joints: Plain, remarks: list[str]) -> Draft:
+def _finished(name: str, description: str, buses: Report, joints: Report, remarks: list[str]) -> Draft:
     """Return the head with a drive for each joint whose name stands for one channel that no other joint's does."""
     for channel, known in _CHANNELS.items():
         named = [joint for joint in joints if _stands_for(known, joint)]

@@ -356,10 +356,10 @@ class Member:
         if self.mismatch:
             self._report(self.mismatch)
 
-    def distrust(self, fault: str, now_s: float) -> None:
-        """Start it up as if it had been away: something may have happened unseen."""
+    def distrust(self, now_s: float) -> None:
+        """Start it up as if it had been away, after its watchdog has tripped: something may have happened unseen."""
         if self.state in _DRIVEN | {"rejoining"}:
-            self._trouble = fault
+            self._trouble = "watchdog"
             self._return(now_s)
 
     # --- the way back -------------------------------------------------------------------------------------------

@@ -111,7 +111,7 @@ class Settings:
             member.take_torque(bool(value), now_s)
         elif name == BUS_WATCHDOG and value < 0:  # it has tripped
             self._pending[BUS_WATCHDOG].pop(member.id, None)
-            member.distrust("watchdog", now_s)
+            member.distrust(now_s)
 
     def arm(self, servos: Iterable[int], watchdog: int) -> None:
         """Set the watchdogs that stop the servo."""
