@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -201,21 +201,20 @@ def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bo
         rows = {"ARIG": {}, **PRINTED[name].get("readings", {}), **PRINTED[name]["ablations"]}
         folders = {
             label: [
-                trained("arig", TrainOptions(
-                    file=options.training or training_file("arig"), data=data, steps=options.steps,
-                    out=models / (label.translate(_OF_A_FOLDER).lower() if differing else unchanged),
-                    seed=None if trial == 1 else trial, **differing,
-                ))
+                trained(
+                    "arig",
+                    options,
+                    models / (label.translate(_OF_A_FOLDER).lower() if differing else unchanged),
+                    file=options.training,
+                    seed=None if trial == 1 else trial,
+                    **differing,
+                )
                 for trial in range(1, options.seeds + 1)
             ]
             for label, differing in rows.items()
-        } | folders  # fmt: skip
+        } | folders
     elif models is not None:
-        folders[LABELS["arig"]] = [
-            trained("arig", TrainOptions(
-                file=training_file("arig"), data=data, out=models / "arig-as-written", steps=options.steps
-            ))
-        ]  # fmt: skip
+        folders[LABELS["arig"]] = [trained("arig", options, models / "arig-as-written")]
     answers = {}
     for label, each in folders.items():
         rolled = [
@@ -231,22 +230,22 @@ def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bo
     return found if name == "arig-2" else {**found, "claims": said}
 
 
-def training_file(kind: Kind) -> Path:
-    """Return the file with the training of a paper's listener as written."""
-    return data_dir("configs") / "training" / f"{kind}-as-written.yaml"
+def trained(
+    kind: Kind, options: TableOptions, out: Path, file: Path | None = None, seed: int | None = None, **more: Any
+) -> Path:
+    """Return a folder with a listener of a paper, trained if it is missing: `out`, or OUT-seedN.
 
-
-def trained(kind: Kind, options: TrainOptions) -> Path:
-    """Return a folder with a listener of a paper, trained with `options` if it is missing: `out`, or OUT-seedN.
-
-    Training takes half an hour or more of one core; an interrupted one is resumed. Raises ConfigError.
+    `file`: of the training; None: the paper as written. `more`: other fields of `TrainOptions`. Training takes half an
+    hour or more of one core; an interrupted one is resumed. Raises ConfigError.
     """
-    out = options.out if options.seed is None else options.out.with_name(f"{options.out.name}-seed{options.seed}")
-    if load_training(options.file).listener.kind != kind:
-        raise ConfigError(f"{options.file}: listener.kind is not {kind}")
+    file = file or data_dir("configs") / "training" / f"{kind}-as-written.yaml"
+    out = out if seed is None else out.with_name(f"{out.name}-seed{seed}")
+    if load_training(file).listener.kind != kind:
+        raise ConfigError(f"{file}: listener.kind is not {kind}")
+    how = TrainOptions(file=file, data=options.data, out=out, steps=options.steps, seed=seed, **more)
 
     def begun(job: str) -> TrainOptions:
-        return replace(options, out=out, resume=checkpoint_file(out, job).is_file(), tensorboard=False)
+        return replace(how, resume=checkpoint_file(out, job).is_file(), tensorboard=False)
 
     if not (out / checkpoint.WEIGHTS).is_file():
         if kind == "sfms" and not (out / TOKENIZER_WEIGHTS).is_file():
@@ -293,10 +292,7 @@ def sfms_table(number: int, names: Sequence[str], options: TableOptions) -> Figu
     data, order, samples = options.data, options.order, options.samples
     listeners = {name: load_at_hop(name, options.hop, "auto") for name in names}
     if options.models is not None:
-        written = trained("sfms", TrainOptions(
-            file=training_file("sfms"), data=data, out=options.models / "sfms-as-written", steps=options.steps,
-            order=order,
-        ))  # fmt: skip
+        written = trained("sfms", options, options.models / "sfms-as-written", order=order)
         listeners[LABELS["sfms"]] = load_at_hop(str(written))
     space = shared_space(listeners)
     features = {one.frontend.audio for one in listeners.values() if isinstance(one, SfmsListener)}
