@@ -174,22 +174,24 @@ def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_ser
         "device": {"agent_audio": "device:robot.monitor"},
         "program": {"agent": speech},
     }
-    levels = []
-    for taken_out in (False, True):
-        ear, hearing = hear("mic:person.monitor"), hear("mic:person.monitor", **(how[told_by] if taken_out else {}))
-        player = play("robot", tmp_path / "played.wav")
-        ear.until(lambda ear=ear: heard_loud_s(ear) is not None)
-        told_s = heard_loud_s(ear) + CALLED_S - 0.1
-        assert time.monotonic() < told_s, "this computer is too busy to be told in time"
-        speech.say(said, AUDIO_HZ, told_s)
-        hearing.start(told_s)
-        frames = hearing.seconds(6.0)
-        levels.append(energy_db(heard(frames[75:])))
-        player.wait()
-        ear.source.close()
-        hearing.source.close()
+    ear, hearing = hear("mic:person.monitor"), hear("mic:person.monitor", **how[told_by])
+    player = play("robot", tmp_path / "played.wav")
+    ear.until(lambda: heard_loud_s(ear) is not None)
+    told_s = heard_loud_s(ear) + CALLED_S - 0.1
+    assert time.monotonic() < told_s, "this computer is too busy to be told in time"
+    speech.say(said, AUDIO_HZ, told_s)
+    for listening in (ear, hearing):
+        listening.frames.clear()
+        listening.start(told_s)
+    for _ in range(150):
+        ear.seconds(FRAME_S)
+        hearing.seconds(FRAME_S)
+    player.wait()
+    # Frame by frame: on a busy computer the sound server drops some, and the canceller needs a moment after each.
+    settled = [[energy_db(frame.audio) for frame in one.frames[75:] if len(frame.audio)] for one in (ear, hearing)]
+    levels = [np.median(decibels) for decibels in settled]
     assert levels[0] > -40.0 and levels[1] < levels[0] - 15.0
-    assert any(frame.agent_audio is not None and frame.agent_audio.any() for frame in frames)
+    assert any(frame.agent_audio is not None and frame.agent_audio.any() for frame in hearing.frames)
 
 
 def test_a_loudspeaker_is_heard_without_a_microphone_too(sound_server):
