@@ -45,7 +45,7 @@ def tokenizer(
     size: Literal["small", "paper"] = Option("small", help="Of what is trained; paper: for a GPU."),
     steps: int | None = Option(None, min=1, help="Another number of training steps than the size's."),
     seeds: int = Option(1, min=1, help="Trainings of each tokenizer of the table, into --models."),
-    only: str = Option("*", metavar="PATTERN", help="Tokenizers of the table to compare, as in 'sparse-all-k7*'."),
+    only: str = Option("*", metavar="PATTERN", help="Tokenizers of the table, as in 'sparse-all-k7,*-static'."),
     jobs: int = Option(1, min=1, help="Tokenizers trained at once."),
     plots: Path | None = Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
     order: Order | None = ORDER,

@@ -22,6 +22,7 @@ import fnmatch
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -349,7 +350,7 @@ def evaluate_table(
         size: Of what is trained.
         steps: Of training, in place of the size's.
         seeds: Trainings of each tokenizer, with seeds from 1 on.
-        only: Pattern of the names of tokenizers that are compared.
+        only: Patterns of the names of tokenizers that are compared, with commas between them.
         jobs: Processes that train.
         plots: Folder for pictures.
     """
@@ -364,9 +365,10 @@ def evaluate_table(
     recorded = read_takes(data_dir("sim") / "listeners" / "takes.npz")
     held_out = recorded["held_out"] if data is None else folder_takes(data)
     names = dict.fromkeys(name for each in chosen for name in needed(each, models is None))
-    wanted = [one for name in fnmatch.filter(names, only) for one in seeded(name, seeds)]
-    if not wanted:
-        raise ConfigError(f"--only {only}: expected a pattern of tokenizers of this table (valid: {', '.join(names)})")
+    compared = [fnmatch.filter(names, pattern) for pattern in only.split(",")]
+    if not all(compared):
+        raise ConfigError(f"--only {only}: expected patterns of tokenizers of this table (valid: {', '.join(names)})")
+    wanted = [one for name in dict.fromkeys(chain(*compared)) for one in seeded(name, seeds)]
     if missing := wanted if train else missing_in(folder, wanted, may_train=models is not None):
         examples = Windows.of(recorded["held_out"], 48).motion  # the length of every recipe, as in the paper
         train_all(missing, folder, recorded["train"], examples, size=size, steps=steps, jobs=jobs, again=train)
