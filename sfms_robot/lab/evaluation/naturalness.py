@@ -1,11 +1,11 @@
 """`evaluate naturalness`: a listener's motion beside that of people whose motion it was never trained on.
 
 Besides statistics of movement and drift, a small network tries to distinguish the two: a classifier two-sample test
-(Lopez-Paz and Oquab 2017). Both motions are cut into windows of two seconds, by region of the face, after the same 6 Hz
-low-pass and with the noise of a face tracker, so that motion is judged, not rounding or a missing tremor. A network of
-three convolutions learns on the windows of most dyads and scores those of the others, in folds by dyad: no speaker and
-no stretch of a meeting is on both sides. The area under its ROC curve is 0.5 for indistinguishable motions, 1 for
-always distinguishable ones.
+(Lopez-Paz and Oquab 2017). Both motions are cut into windows of two seconds, by region of the face, after the same 6
+Hz low-pass and with the noise of a face tracker, so that motion is judged, not rounding or a missing tremor. A network
+of three convolutions learns on the windows of most dyads and scores those of the others, in folds by dyad: a dyad
+is on one side alone, while a person or a voice may be on both, since a part has few of them. The area under its ROC
+curve is 0.5 for indistinguishable motions, 1 for always distinguishable ones.
 
 Network, windows, noise and seeds are fixed: figures are comparable between versions, and nothing here may ever become a
 training loss.
