@@ -62,10 +62,8 @@ def meeting(talk, nods_s):
 
 def contingency(decides, speaker, one):
     """AUC matched, and matched minus shifted."""
-    matched, other = (
-        hazards_in(decides, sensed(frames, Calmness())[1], one.history, Calmness())["nod"]
-        for frames in (speaker, shifted(speaker))
-    )
+    heard = (sensed(frames, Calmness())[1] for frames in (speaker, shifted(speaker)))
+    matched, other = (hazards_in(decides, each, one.history, Calmness())["nod"] for each in heard)
     found = timing.contingent("", "x", matched, [other], one)
     return found["x"][0] / found["x"][1], found["x_matched_minus_shifted"][0] / found["x"][1]
 
@@ -133,16 +131,18 @@ def turns(deciles_s, frames, rng):
 @pytest.mark.parametrize("speaks", [True, False])
 def test_a_rate_is_true_of_a_head_that_speaks_and_of_one_that_never_does(speaks):
     rng, frames = np.random.default_rng(1), 60 * 60 * FRAME_HZ
-    asked = {"nod": 2.0, "smile": 1.2, "brow_raise": 1.0}
+    asked = {"nod": 2.0, "smile": 1.2, "brow_raise": 1.0, "mm_hm": 1.2}
     voices = np.stack([turns(each, frames, rng) for each in TURNS_S], axis=1)
-    laughs, smiles = (np.repeat(rng.random(frames // 50) < share, 50) for share in (0.02, 0.01))
-    scene = Scene(voices, np.full(voices.shape, np.nan), laughs, np.zeros(frames, bool), 0.6 * (laughs | smiles))
+    shares = ((0.02, 50), (0.01, 50), (0.08, 20))  # of laughs, smiles, two others at once: a table of four
+    laughs, smiles, joins = (np.repeat(rng.random(frames // each) < share, each) for share, each in shares)
+    voices, nods = np.c_[voices, voices[:, 1] & joins], rng.random(frames) < 5.8 / 60 / FRAME_HZ
+    scene = Scene(voices, np.full(voices.shape, np.nan), laughs, nods, 0.6 * (laughs | smiles))
     heard = heard_in(scene if speaks else unspoken(scene))
-    decided = decisions(EventModel.load(), heard, range(4), Calmness(**asked, blink=0, gaze_shift=0))
+    decided = decisions(EventModel.load(), heard, range(8), Calmness(**asked, blink=0, gaze_shift=0))
     listening = (heard[:, AT["silence_s"]] <= 2.0) & (heard[:, AT["own_voice_s"]] > 0)
     for kind, rate in asked.items():
         count = sum(len(event_spans(events, kind)) for events in decided)
-        assert count / (4 * listening.sum() / FRAME_HZ / 60) == pytest.approx(rate, rel=0.15), kind
+        assert count / (8 * listening.sum() / FRAME_HZ / 60) == pytest.approx(rate, rel=0.15), kind
 
 
 @pytest.mark.slow
@@ -152,9 +152,8 @@ def test_seeds_scatter_as_people_do_and_some_do_not_nod_in_the_demo_at_all():
     voice = recording.read(recording.length)
     recording.close()
     frames, when = len(voice) // FRAME_SAMPLES, EventModel.load()
-    _, heard = sensed(
-        speaker_frames(voice[: frames * FRAME_SAMPLES], np.full((frames, 58), np.nan, np.float32)), Calmness()
-    )
+    unseen = np.full((frames, 58), np.nan, np.float32)
+    _, heard = sensed(speaker_frames(voice[: frames * FRAME_SAMPLES], unseen), Calmness())
     counts = np.array([len(event_spans(events, "nod")) for events in decisions(when, heard, range(300), Calmness())])
     assert 3 <= counts.mean() / (frames * FRAME_S / 60) <= 7, "addressed: as many a minute as people's"
     assert 1.28 <= counts.var(ddof=1) / counts.mean() <= 1.82 and 0.03 <= (counts == 0).mean() <= 0.15
