@@ -108,8 +108,7 @@ class BatchEngine(TorchEngine):
             yield
         except torch.OutOfMemoryError as error:
             self._batches.clear()
-            if self._pool is not None:
-                torch.cuda.empty_cache()
+            torch.cuda.empty_cache()  # does nothing without a GPU
             raise MemoryError(f"too little memory on the GPU for {streams} heads at once") from error
 
 
@@ -136,10 +135,13 @@ class _NetworkBatch:
     def run(self, inputs: Sequence[Tensor], streams: int) -> tuple[Array, ...]:
         """Return the outputs (streams, ...) of inputs (streams, ...) or (1, ...)."""
         for kept, each in zip(self._inputs, inputs, strict=True):
-            kept[:streams].copy_(each, non_blocking=True)
-        if self._graph is not None:
+            # Only from pinned memory is an input sent while the next one is prepared.
+            kept[:streams].copy_(each.pin_memory() if kept.is_cuda else each, non_blocking=True)
+        outputs = self._outputs
+        if self._graph is None:
+            outputs = self._network(*self._inputs)
+        else:
             self._graph.replay()
-        outputs = self._outputs if self._graph is not None else self._network(*self._inputs)
         if self._done is not None:
             self._done.record()
             self._done.synchronize()

@@ -62,13 +62,13 @@ class Corpus(Generic[Frames]):
         frames: tensors (N, ...).
         lengths: frames of each dyad.
         scenes: the kind of conversation each dyad is of.
-        staged: The frames lie on disk, and only windows of them go to another device.
+        staged: The frames lie on disk, and only windows of them go to this device. None: frames in memory.
     """
 
     frames: Frames
     lengths: tuple[int, ...]
     scenes: tuple[str, ...]
-    staged: bool = False
+    staged: torch.device | None = None
 
     @cached_property
     def begins(self) -> Tensor:
@@ -96,14 +96,22 @@ class Corpus(Generic[Frames]):
         return {name: starts[torch.from_numpy(scene == name)] for name in dict.fromkeys(scene.tolist())}
 
     def cut(self, starts: Tensor, window: int) -> Frames:
-        """Return the windows (B, window, ...) at (B,) starts, on the device of the starts."""
-        at, to_gpu = starts.device, starts.is_cuda
-        return _each(self.frames, lambda part: windows(part, starts, window).to(at, non_blocking=to_gpu))
+        """Return the windows (B, window, ...) at (B,) starts, on the device of `to`; the starts lie on the CPU."""
+        to = self.staged or self.begins.device
+        if self.staged is None:
+            starts = starts.to(to, non_blocking=True)
+
+        def sent(part: Tensor) -> Tensor:
+            found = windows(part, starts, window)
+            # Only from pinned memory is a window sent while the next one is read.
+            return (found.pin_memory() if found.device.type != to.type else found).to(to, non_blocking=True)
+
+        return _each(self.frames, sent)
 
     def to(self, device: torch.device) -> Corpus[Frames]:
         """Return the same frames on another device; staged ones stay on disk."""
         if self.staged:
-            return self
+            return replace(self, staged=device)
         return replace(self, frames=_each(self.frames, lambda part: part.to(device)))
 
     def fingerprint(self) -> Figures:
@@ -321,7 +329,7 @@ def read_staged(like: Frames, folder: Path) -> Corpus[Frames]:
         if size:
             flat = torch.from_file(str(folder / f"{name}.frames"), shared=False, size=size, dtype=tensor.dtype)
         found[name] = flat.view(shape)
-    return Corpus(replace(like, **found), tuple(index["lengths"]), tuple(index["scenes"]), staged=True)
+    return Corpus(replace(like, **found), tuple(index["lengths"]), tuple(index["scenes"]), torch.device("cpu"))
 
 
 @contextmanager
@@ -345,7 +353,7 @@ def _made_for(settings: AnyTraining) -> Figures:
     """Return the settings that frames depend on, as plain data."""
     windows = settings.training if isinstance(settings, config.ArigTraining) else settings.listener
     known = settings.listener.model_dump(mode="json")
-    return {**{name: known.get(name) for name in _MADE_FOR}, "window": windows.window_frames}
+    return {name: known.get(name) for name in _MADE_FOR} | {"window": windows.window_frames}
 
 
 def write_pack(file: Path, corpora: Mapping[str, Corpus[Any]], settings: AnyTraining) -> None:
@@ -449,12 +457,11 @@ def sway_of(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor
         raise ValueError("no motion of 2 s or more to fit sway on")
     sizes = torch.stack([track.square().mean(0).sqrt().clamp(min=1e-9).log() for track in tracks])  # (K, S)
     common = (sizes - sizes.mean(0)).mean(1)  # of the whole head
-    weight = torch.tensor([float(len(track)) for track in tracks], dtype=torch.float64)
     spread = common.std(correction=0)
     powers = torch.stack(
-        [band_powers(track / one.exp()) * weight_ for track, one, weight_ in zip(tracks, common, weight, strict=True)]
+        [band_powers(track / one.exp()) * len(track) for track, one in zip(tracks, common, strict=True)]
     )
-    powers = _one_side(powers, lateral).sum(0) / weight.sum()
+    powers = _one_side(powers, lateral).sum(0) / sum(map(len, tracks))
     value, vector = torch.linalg.eigh(powers)
     root = vector * value.clamp(min=0).sqrt()[:, None] @ vector.mT  # symmetric
     return root.float(), spread.float()

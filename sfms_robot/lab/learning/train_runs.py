@@ -153,9 +153,10 @@ def device_of(name: str) -> torch.device:
     """Return the device of `cpu`, `cuda`, or `auto`: the GPU if there is one. Raises ConfigError."""
     if name not in DEVICES:
         raise ConfigError(f"--device {name!r} is not one of {', '.join(DEVICES)}")
-    if name == "cuda" and not torch.cuda.is_available():
+    there = torch.cuda.is_available()
+    if name == "cuda" and not there:
         raise ConfigError("--device cuda: torch sees no CUDA device here (auto, cpu)")
-    return torch.device("cuda" if name != "cpu" and torch.cuda.is_available() else "cpu")
+    return torch.device("cuda" if there and name != "cpu" else "cpu")
 
 
 def train_settings(options: TrainOptions, phase: str = "training") -> AnyTraining:

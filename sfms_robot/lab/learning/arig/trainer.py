@@ -98,7 +98,7 @@ def arig_job(
 
     def loss_of(step: int, generator: Generator, batch: int) -> Tensor:
         chosen = draw(starts, weights_of(phase.stage(step), starts), batch, generator, eventful, phase.event_windows)
-        dyad = cut(corpus, chosen.to(device, non_blocking=True), phase.window_frames)
+        dyad = cut(corpus, chosen, phase.window_frames)
         noise = noise_of(generator, device)
         told, truth = augment(dyad, student.model, phase, noise)
         return loss_parts(student, told, dyad.states, truth, phase, noise).total(phase)
@@ -169,7 +169,7 @@ def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase
     chosen = draw(starts, weights_of(phase.stages[-1], starts), HELD_OUT_WINDOWS, generator)
     found = []
     for some in torch.split(chosen, HELD_OUT_BATCH):
-        dyad = cut(corpus, some.to(student.readout.weight.device), phase.window_frames)
+        dyad = cut(corpus, some, phase.window_frames)
         found.append(loss_parts(student, dyad, dyad.states, dyad.agent_motion, phase, generator))
     return LossParts(*(torch.stack(each).mean() for each in zip(*found, strict=True)))
 

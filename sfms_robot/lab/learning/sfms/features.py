@@ -232,9 +232,9 @@ def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> T
             size = len(dyad)
         whole, rest = divmod(len(dyad), size)
         sizes = [size] * whole
-        if rest and (rest >= tokenizer.window or not sizes):
+        if not sizes or rest >= tokenizer.window:
             sizes.append(rest)
-        elif rest:  # no stretch is shorter than a window, unless there is only one
+        else:  # no stretch is shorter than a window, unless there is only one
             sizes[-1] += rest
         pieces += torch.split(dyad, sizes)
     alike: dict[int, list[int]] = {}  # pieces of one length are placed together

@@ -290,7 +290,9 @@ def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, placed: TokensOf = "dy
     for seen, target in Lessons(model, corpus, placed).some(Generator().manual_seed(0)):
         expected = model.predictor.teacher_forced(seen, target).softmax(-1)[..., 0] < 0.5
         key = target > 0
-        hit, said, true = hit + int((expected & key).sum()), said + int(expected.sum()), true + int(key.sum())
+        hit += int((expected & key).sum())
+        said += int(expected.sum())
+        true += int(key.sum())
     return {"keyframe_recall": hit / max(1, true), "keyframe_precision": hit / max(1, said)}
 
 
