@@ -368,6 +368,7 @@ def returned_smiles(voices: Folders, speakers: int | None, minutes: float, seeds
     shares = np.array(answered)
     difference = shares[:, 0] - shares[:, 1]
     return {
+        "split": "validation and test",
         "speakers": [speaker.name for speaker in people],
         "minutes": length_s / 60,
         "answered": rounded(shares[:, 0].mean()),

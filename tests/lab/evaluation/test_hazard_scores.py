@@ -1,4 +1,4 @@
-"""Hazards asked with somebody's history go by it; decisions go by their own, whoever is decided for beside."""
+"""Hazards asked with a given history go by it; decisions go by their own, whatever is decided beside them."""
 
 import numpy as np
 import pytest
