@@ -30,12 +30,6 @@ def test_way_out_closes_behind_a_joint_that_comes_in(outside, share):
         goals.ticks(np.array([nearer + 0.01]), FIRST)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1.1, -1.1])
-def test_goal_that_is_no_goal_is_named(bad):
-    with pytest.raises(ValueError, match="goal of joint1 "):
-        goals_of(2).ticks(np.array([0.0, bad]), BOTH)
-
-
 def test_a_joint_that_is_not_sent_is_not_judged_keeps_its_way_in_and_is_asked_for_nothing_that_is_not_finite():
     goals = goals_of(2)
     goals.hold(1, 2.0)

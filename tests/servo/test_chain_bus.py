@@ -135,13 +135,6 @@ def test_pinched_joint_is_let_go_by_whoever_tells_its_current(models):
     assert all(": pinched" in fault for fault in rig.bus.statistics()["faults"])
 
 
-def test_torque_limit_of_an_earlier_run_is_lifted():
-    rig = rig_of("ax-12a", [512])
-    rig.set(1, "torque_limit", 200)
-    rig.hold()
-    assert rig.register(1, "torque_limit") == 1023
-
-
 def test_servo_that_shut_down_gets_its_strength_back_only_where_it_stands():
     rig = rig_of("ax-12a", [512], safety=Safety(torque_limit_percent=30))
     rig.set(1, "torque_limit", 0)
@@ -165,17 +158,6 @@ def test_mode_that_cannot_be_changed_under_torque_is_an_error():
     rig.set(1, "torque_enable", 1)
     with pytest.raises(ServoError, match=r"joint1 \(id 1\) has torque on and operating_mode 1, must be 0"):
         rig.bus.connect()
-
-
-def test_mx_servos_are_read_together_and_a_mixed_bus_one_by_one():
-    together = rig_of("mx-28-1.0", [2048] * 6)
-    held, before = together.hold(), len(together.port.sent)
-    together.ticks(held, 10)
-    assert 22 <= len(together.port.sent) - before <= 24  # goals, a bulk read; torque and settings now and then
-    single = rig_of("ax-12a", [512] * 6)
-    held, before = single.hold(), len(single.port.sent)
-    single.ticks(held, 10)
-    assert 80 <= len(single.port.sent) - before <= 82  # goals, six reads, one closer look; settings now and then
 
 
 def test_reading_one_by_one_keeps_to_its_budget_and_reaches_everybody():

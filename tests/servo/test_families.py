@@ -49,11 +49,6 @@ def installed(tmp_path, monkeypatch):
     families.cache_clear()
 
 
-def test_family_of_another_package_is_there_by_its_name(installed):
-    installed("herkulex = sfms_herkulex:FAMILY")
-    assert family_named("herkulex") == BusFamily("HerkuleX", "collections:OrderedDict", ("herkulex", None))
-
-
 @pytest.mark.parametrize(
     ("line", "problem"),
     [

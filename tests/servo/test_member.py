@@ -73,6 +73,15 @@ def refuses(member, failure=None):
     member.startup.failure = failure
 
 
+def mute_again(member):
+    """It is silent once more while it comes back at 1 s."""
+    silent(member)
+    member.back(1.0)
+    refuses(member, Silent("no answer"))
+    run(member, 1.0)
+    refuses(member)
+
+
 def refused_often(member):
     refuses(member, ServoError("is another model"))
     member.back(0.0)
@@ -80,7 +89,8 @@ def refused_often(member):
         run(member, k * rules.REFUSED_S)
 
 
-EVENTS = {each.__name__: each for each in (run, silent, fails, overloads, refuses, refused_often)}
+EVENTS = {each.__name__: each for each in (run, silent, fails, overloads, mute_again, refused_often)}
+AGAIN_S = 1.0 + rules.RETRY_S
 
 
 def pinch(then, **more):
@@ -97,6 +107,8 @@ ARROWS = [  # how its head is set, what happens, where it is then, the fault it 
     ({}, [("silent",), ("back", 1.0), ("run", 1.0)], REJOINING, None),
     ({}, [("silent",), ("back", 1.0), ("run", 1.0), ("silent", 2.0)], SILENT, "no answer"),
     ({}, [("silent",), ("back", 1.0), ("silent", 1.1)], SILENT, "no answer"),
+    ({}, [("mute_again",), ("run", AGAIN_S - 0.01)], RETURNING, "no answer"),
+    ({}, [("mute_again",), ("run", AGAIN_S)], REJOINING, None),
     ({}, [("silent",), ("refused_often",)], GIVEN_UP, "left alone"),
     ({}, [("silent",), ("refused_often",), ("enabled",)], ONLINE, None),
     ({}, [("silent",), ("released",), ("called_back", 1.0)], SILENT, "no answer"),
@@ -161,16 +173,13 @@ def test_rejoining_to_online_by_a_goal_near_to_where_it_stands(member):
     assert member.accepts(STANDS + 5) and member.state == ONLINE and member.gets_goals
 
 
-def test_returning_goes_on_after_a_silence_of_its_own(member):
-    silent(member)
-    member.back(1.0)
-    refuses(member, Silent("no answer"))
-    run(member, 1.0)
-    refuses(member)
-    run(member, 1.0 + rules.RETRY_S - 0.01)
-    assert member.state == RETURNING
-    run(member, 1.0 + rules.RETRY_S)
-    assert member.state == REJOINING
+def test_pinch_needs_current_without_a_break():
+    member = made(**pinch("limp"))
+    for current_mA, now_s in ((150, 0.00), (50, 0.06), (-150, 0.08)):
+        member.take_current(current_mA, now_s)
+        assert member.state == ONLINE
+    member.take_current(-150, 0.19)
+    assert (member.state, member.fault) == (LIMP, "pinched")
 
 
 @pytest.mark.parametrize("before", [state for state in STATES if state != OFF])

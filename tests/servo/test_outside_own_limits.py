@@ -184,16 +184,6 @@ def sagged():
     return plugged([EmulatedServo(1, start_ticks=2048), EmulatedServo(2, start_ticks=SAGGED, registers=STORED)])
 
 
-def test_enable_waits_for_it_and_says_so(caplog):
-    caplog.set_level(NOTE)
-    rig = sagged()
-    held = rig.hold()
-    assert rig.state(2)["position"] >= STORED["min_position_limit"]
-    assert "joint2 (id 2) stands at 1200, outside its own limits 1300..2800: moving it inside at 20" in caplog.text
-    readings = rig.ticks(held, 20)
-    assert readings["joint2"].fault is None and readings["joint2"].position_rad == pytest.approx(held[1], abs=0.01)
-
-
 def test_torque_off_from_outside_ends_enable_with_torque_off():
     rig = sagged()
     rig.bus.connect()

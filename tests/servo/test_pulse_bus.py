@@ -7,7 +7,6 @@ from board_rig import LIMIT_RAD, Bench
 from emulated_port import EmulatedPort, Straight, bus_servo
 
 from sfms_robot.config import BusConfig, load_firmware_map
-from sfms_robot.config.wire_time import FRAMINGS
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.servo.codecs import maestro
 from sfms_robot.servo.pulse_bus import PulseBus
@@ -71,15 +70,6 @@ def test_what_did_not_change_is_sent_in_turn_only(bench):
     assert sorted(channels) == sorted(b"0125" if bench.bus.model == "ssc-32" else [0, 1, 2, 5])
 
 
-def test_maestro_takes_neighbours_in_one_command_where_it_can():
-    large, small = Bench("maestro-24"), Bench("maestro-6")
-    for bench in (large, small):
-        bench.hold()
-        bench.ticks([0.5, -0.5, 0.25, 0.1], 1)
-    assert large.port.sent[-1][:3] == bytes([maestro.SET_TARGETS, 3, 0])
-    assert [small.port.sent[-1][i] for i in range(0, 16, 4)] == [maestro.SET_TARGET] * 4
-
-
 @pytest.mark.parametrize(
     ("file", "board", "cure"),
     [(False, True, "expects a CRC: set crc: true for this bus"), (True, False, "expects no CRC: set crc: false")],
@@ -89,12 +79,6 @@ def test_wrong_crc_setting_is_named_with_its_cure(file, board, cure):
     with pytest.raises(BusError, match=rf"^bus 'face' on emulated at 115200 baud: the maestro-24 {cure}.*'Enable CRC'"):
         bench.bus.connect()
     assert bench.port.closed
-
-
-def test_connecting_to_a_maestro_with_crc_leaves_no_error_behind():
-    bench = Bench(crc=(True, True))
-    bench.bus.connect()
-    assert bench.board.errors == 0
 
 
 def test_slow_wire_carries_the_newest_goals_and_never_piles_up():
@@ -221,18 +205,6 @@ def test_two_boards_on_one_bus_are_refused():
     with pytest.raises(ConfigError, match="one board is one model, the head says maestro-6 and maestro-24"):
         config = BusConfig(family="maestro", baud=115200)
         PulseBus("face", servos, Straight(six), lambda: EmulatedPort(None), 115200, 0.0, config)
-
-
-@pytest.mark.parametrize(
-    ("model", "family"), [("maestro-24", "maestro"), ("maestro-6", "maestro"), ("ssc-32", "ssc32")]
-)
-def test_goals_take_the_bytes_that_are_counted(model, family):
-    channels = (0, 2, 4) if family == "maestro" else (10, 12, 14)  # none beside another, and of two digits
-    bench = Bench(model, channels)
-    bench.ticks(bench.hold(), 2)
-    bench.port.sent.clear()
-    bench.ticks(np.full(3, 0.1), 1)
-    assert len(bench.port.sent[0]) == FRAMINGS[family].goals(3)
 
 
 @pytest.mark.parametrize("silent", [False, True])

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.config import load_firmware_map
-from sfms_robot.servo.registers import ASSUMED_SPEED_DEG_S, Table
+from sfms_robot.servo.registers import Table
 
 X = Table.of(load_firmware_map("xl330-m288"))
 AX = Table.of(load_firmware_map("ax-12a"))
@@ -81,13 +81,3 @@ def test_role_leads_to_the_register_of_each_family(role, names):
 def test_lock_until_power_off_is_not_the_lock_that_tools_open_and_close():
     assert AX["lock"].writable and AX.role("lock") is None
     assert STS.role("lock") == STS["lock"]
-
-
-def test_channels_speed_and_factory_baud_rate_are_read_from_the_map():
-    assert (MAESTRO.channels, MAESTRO.tick_us, MAESTRO.protocol, MAESTRO.size) == (24, 0.25, None, 0)
-    assert MAESTRO.center_ticks * MAESTRO.tick_us == 1500.0 and MAESTRO.role("present_position") is None
-    unknown = Table.of(load_firmware_map("sts3032"))
-    assert unknown.top_speed_ticks_s == pytest.approx(ASSUMED_SPEED_DEG_S * 4096 / 360)
-    assert X.top_speed_ticks_s == pytest.approx(618 * 4096 / 360)
-    assert [table.default_baud for table in SERVOS.values()] == [57_600, 1_000_000, 57_600, 1_000_000, 1_000_000]
-    assert MAESTRO.default_baud is None
