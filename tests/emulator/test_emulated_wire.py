@@ -6,7 +6,6 @@ from emulated_devices import device_of, servos_of
 from sfms_robot.emulator.emulated_wire import EmulatedWire
 from sfms_robot.emulator.faults import parse_fault
 from sfms_robot.emulator.launch import EmulatedServo
-from sfms_robot.errors import ConfigError
 from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.codecs.dxl2 import encode_instruction, maybe_packet
 
@@ -116,13 +115,6 @@ def test_echo_comes_before_the_answer_and_noise_behind():
     assert sent.startswith(request) and len(sent) > len(request) + 15
 
 
-def test_silent_and_stuck_last_as_long_as_they_say():
-    wire = wire_of(1, 2, faults=["silent:1@1-2", "stuck:2@1-2"])
-    for now_s, silent in ((0.5, False), (1.5, True), (2.5, False)):
-        wire.advance(now_s)
-        assert (wire.servo(1).dead, wire.servo(2).plant.stuck) == (silent, silent)
-
-
 def test_brown_out_silences_everybody_and_lets_them_start_anew():
     wire = wire_of(1, 2, faults=["brownout@1-1.5"])
     for servo in (1, 2):
@@ -138,11 +130,6 @@ def test_overload_overheat_and_voltage_are_latched():
     wire.advance(3.0)
     assert [wire.servo(i).fault_status for i in (1, 2, 3)] == [1 << 5 | 1, 1 << 2 | 1, 1]
     assert wire.servo(3).supply_v == 5.0
-
-
-def test_fault_that_concerns_nobody_is_refused():
-    with pytest.raises(ConfigError, match="'drop:9' concerns no servo"):
-        wire_of(1, faults=["drop:9"])
 
 
 def test_unplugged_wire_hears_nothing_but_counts():

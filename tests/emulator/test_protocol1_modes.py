@@ -71,22 +71,6 @@ def test_a_wheel_turns_at_the_speed_it_is_told_and_shows_one_turn(model, registe
     assert bool(bench.read(speed) & sign) is (ticks_s < 0) or model == SCS
 
 
-def test_an_ax_wheel_passes_its_gap():
-    bench = Bench(AX, cw_angle_limit=0, ccw_angle_limit=0)
-    bench.write(24, 1)
-    bench.write(32, 0xFF, 0x03)
-    seen = {bench.after(0.013).read(36) for _ in range(300)}
-    assert max(seen) == 1023 and min(seen) < 20
-
-
-def test_an_sts_wheel_obeys_its_acceleration():
-    bench = Bench(STS, operating_mode=1)
-    for address, data in ((41, [10]), (40, [1]), (46, bench.word(1000))):  # 1000 step/s^2
-        bench.write(address, *data)
-    start = bench.shaft
-    assert bench.after(0.5).shaft - start == pytest.approx(125, rel=0.3)
-
-
 def test_mx_multi_turn_goes_beyond_one_turn_and_back():
     bench = Bench(MX, cw_angle_limit=4095, ccw_angle_limit=4095)
     bench.write(30, *bench.word(3 * 4096))

@@ -84,16 +84,6 @@ def test_status_level_decides_who_is_answered():
     assert ask(device, 2, protocol1.WRITE, bytes([40, 0])) == []
 
 
-def test_sync_read_is_answered_in_order_up_to_the_first_that_is_silent():
-    device = chain_of("sts3215", "sts3215", "sts3215")
-    params = protocol1.sync_read_params(56, 2, [3, 1, 2])
-    assert [frame.servo for frame in ask(device, BROADCAST, protocol1.SYNC_READ, params)] == [3, 1, 2]
-    device.servo(1).dead = True
-    assert [frame.servo for frame in ask(device, BROADCAST, protocol1.SYNC_READ, params)] == [3]
-    device.chain_break = False
-    assert [frame.servo for frame in ask(device, BROADCAST, protocol1.SYNC_READ, params)] == [3, 2]
-
-
 def test_what_a_protocol_lacks_is_silence():
     device = chain_of("scs0009", "ax-12a", "mx-28-1.0")
     assert ask(device, BROADCAST, protocol1.SYNC_READ, protocol1.sync_read_params(56, 2, [1])) == []
@@ -102,14 +92,6 @@ def test_what_a_protocol_lacks_is_silence():
     assert answer == Frame(3, 0, b"\x00\x08")
     device = chain_of("sts3215", "ax-12a", "scs0009")
     assert [frame.servo for frame in ask(device, BROADCAST, protocol1.PING)] == [1, 3]
-
-
-def test_factory_reset_gives_back_id_and_baud():
-    device = chain_of("sts3215")
-    put(device, 1, "lock", 0)
-    assert ask(device, 1, protocol1.WRITE, bytes([5, 9])) == [Frame(1, 0, b"")]  # the old id says yes
-    assert ask(device, 1, protocol1.PING) == []
-    assert ask(device, 9, protocol1.FACTORY_RESET) == [Frame(9, 0, b"")] and get(device, 1, "id") == 1
 
 
 def test_overload_comes_from_the_motor_and_takes_the_torque():
@@ -125,14 +107,6 @@ def test_overload_comes_from_the_motor_and_takes_the_torque():
     assert ask(device, 1, protocol1.PING, now_s=3.0)[0].code == 0
 
 
-def test_voltage_bit_is_there_as_long_as_the_voltage_is_wrong():
-    device = chain_of("sts3215")
-    device.servo(1).set_supply(9.5, 0.0)
-    assert ask(device, 1, protocol1.PING)[0].code == protocol1.VOLTAGE and get(device, 1, "present_voltage") == 95
-    device.servo(1).set_supply(7.4, 0.0)
-    assert ask(device, 1, protocol1.PING)[0].code == 0
-
-
 @pytest.mark.parametrize("how", ["torque_enable := 128", "instruction 0x0B"])
 def test_sts_is_calibrated_where_it_stands(how):
     device = chain_of("sts3215", start_ticks=3000)
@@ -143,12 +117,6 @@ def test_sts_is_calibrated_where_it_stands(how):
     assert (get(device, 1, "present_position"), get(device, 1, "homing_offset")) == (2048, 952)
     put(device, 1, "goal_position", 2148)
     assert get(device, 1, "present_position", 2.0) == 2148 and device.servo(1).plant.position == 3100
-
-
-def test_two_servos_with_one_id_both_answer():
-    device = chain_of("ax-12a", "ax-12a")
-    ask(device, 2, protocol1.WRITE, bytes([3, 1]))
-    assert len(ask(device, 1, protocol1.PING)) == 2
 
 
 @given(st.lists(st.binary(max_size=80), max_size=10))

@@ -1,7 +1,5 @@
 """One emulated servo, read and written directly: what its registers do."""
 
-import math
-
 import pytest
 from emulated_devices import ServoBench
 from hypothesis import given
@@ -75,17 +73,6 @@ def test_indirect_data_show_what_their_addresses_say(firmware, first_data):
     assert (error, data) == (0, (2100).to_bytes(4, "little") + bytes([31]))
 
 
-def test_indirect_data_write_through():
-    bench = ServoBench()
-    bench.put(indirect_address_1=65, indirect_address_2=84, indirect_address_3=85)
-    assert bench.servo.write(bench.table["indirect_data_1"].address, bytes([1, 0xBC, 2]), 0.0) == 0
-    assert (bench.get("led"), bench.get("position_p_gain")) == (1, 0x2BC)
-    # Half a register is refused, and then nothing at all is changed.
-    bench.put(indirect_address_3=86)
-    assert bench.servo.write(bench.table["indirect_data_1"].address, bytes([0, 1, 1]), 0.0) != 0
-    assert bench.get("led") == 1
-
-
 def test_a_homing_offset_shifts_and_reverse_mode_mirrors_the_position():
     bench = ServoBench(start=2048, homing_offset=1024)
     assert bench.servo.plant.position == 1024 and bench.get("present_position") == 2048
@@ -138,12 +125,6 @@ def test_current_based_position_mode_gives_way_where_position_mode_overloads():
     assert weak.get("present_current") == pytest.approx(1200 * 200 / 1750, rel=0.1)
     assert weak.get("hardware_error_status") == 0 and weak.get("torque_enable") == 1
     assert strong.get("hardware_error_status") == 1 << 5 and strong.get("torque_enable") == 0
-
-
-def test_profile_by_time_arrives_in_that_time():
-    bench = ServoBench(drive_mode=4, start=2000)
-    bench.put(profile_velocity=1000, profile_acceleration=200, torque_enable=1, goal_position=3000)
-    assert bench.after(0.5) == pytest.approx(2500, abs=60) and bench.after(0.65) == pytest.approx(3000, abs=3)
 
 
 def test_a_goal_brings_torque_where_the_drive_mode_says_so_and_a_new_mode_resets_goals():
@@ -199,23 +180,3 @@ def test_held_load_makes_it_warm_and_too_much_overheats_it():
     assert 33 < warm < 70
     bench.t = 120.0
     assert bench.get("hardware_error_status") & 1 << 2 and bench.get("torque_enable") == 0
-
-
-def test_position_stays_finite_at_the_ends_of_every_range():
-    bench = ServoBench(operating_mode=4)
-    bench.put(torque_enable=1, profile_velocity=32767, profile_acceleration=32767, goal_position=-1048575)
-    for _ in range(20):
-        assert math.isfinite(bench.after(1.0))
-
-
-def test_xl320_torque_limit_starts_at_max_torque_and_holds_the_motor_back():
-    way = {}
-    for most, stored in ((1023, {}), (60, {"max_torque": 60})):
-        bench = ServoBench("xl-320", **stored)
-        assert bench.get("torque_limit") == most
-        bench.put(goal_position=900, torque_enable=1)
-        way[most] = bench.after(0.1) - 512
-        bench.put(torque_limit=5)
-        bench.servo.power_cycle(0.1)
-        assert bench.after(0.4, "torque_limit") == most
-    assert 0 < way[60] < way[1023] / 2
