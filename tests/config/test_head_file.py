@@ -94,18 +94,6 @@ def test_no_family_goes_beyond_a_thousand_and_none_comes_to_a_stop(family, baud)
     assert all(1 <= rate <= 1000 for rate in rates) and rates == sorted(rates, reverse=True)
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "told"),
-    [
-        ("dynamixel2", "dynamixel", r"buses.main.family.* is not a family of buses \(dynamixel2, dynamixel1, feetech"),
-        ("id: 1", "id: 1, safety: {registers: {drive_mode: 1}}", r"jaw.safety.registers.drive_mode = 1 .* \(.*_gain"),
-    ],
-)
-def test_words_of_0_1_0_are_refused_with_the_valid_ones(tmp_path, before, after, told):
-    (line,) = check_head(changed(tmp_path, before, after))
-    assert re.search(told, line)
-
-
 MAPS = [load_firmware_map(file.stem) for file in map_files()]
 HURTS = {
     "goal_position", "torque_enable", "id", "baud_rate", "status_level", "lock", "torque_limit", "bus_watchdog",
@@ -124,17 +112,6 @@ def test_nothing_that_says_who_a_servo_is_or_what_it_does_may_be_written_unasked
             or name.startswith(("goal", "indirect"))
         ):
             assert not is_harmless(table, name), name
-
-
-@pytest.mark.parametrize(
-    "register", ["id", "baud_rate", "operating_mode", "secondary_id", "homing_offset", "drive_mode"]
-)
-def test_a_register_that_renumbers_or_turns_a_servo_is_refused_by_name(tmp_path, register):
-    low = load_firmware_map("xl330-m288").registers[register].low
-    safety = Safety(registers={register: low})
-    ((key, value, problem, choices),) = register_problems(safety, load_firmware_map("xl330-m288"))
-    assert (key, value) == (f"registers.{register}", low) and "stored in xl330-m288 for good" in problem
-    assert "position_p_gain" in choices and register not in choices
 
 
 def test_what_is_stored_is_stored_for_good_and_fits():

@@ -103,16 +103,21 @@ def test_every_shipped_file_names_its_schema_in_the_first_line(pattern):
         assert named != line and (file.parent / named).is_file(), file
 
 
-OPENS = {"id": 9, "min_deg": -10, "max_deg": 20}
+def x(**joint) -> dict:
+    """The joint x, and what else it has."""
+    return {"joints": {"x": {"id": 9, "min_deg": -10, "max_deg": 20, **joint}}}
+
+
+def coupled(*moving: str, at_least=0.0, **keep: float) -> dict:
+    return {"keep": keep, "at_least": at_least, "moving": list(moving)}
+
+
 WRONG = {
     "curve": (
-        {"joints": {"beak": {"id": 3, "drive": {"channel": "jawOpen", "curve": [[0, 0], [0.5, 1], [0.5, 2]]}}}},
-        "joints.beak.drive: curve is not a function: x goes from 0.5 to 0.5, it has to rise",
+        x(drive={"channel": "jawOpen", "curve": [[0, 0], [0.5, 1], [0.5, 2]]}),
+        "joints.x.drive: curve is not a function: x goes from 0.5 to 0.5, it has to rise",
     ),
-    "one point": (
-        {"expressions": {"a": {"channel": "yaw", "curve": [[0, 0]]}}},
-        "expressions.a.curve: Tuple should have at least 2 items",
-    ),
+    "one point": ({"expressions": {"a": {"channel": "yaw", "curve": [[0, 0]]}}}, "a.curve: Tuple should have at least"),
     "circle": (
         {"expressions": {"a": "b", "b": {"sum": ["yaw", "c"]}, "c": {"use": "a", "gain": 2}}},
         "expressions.a uses itself: a -> b -> c -> a",
@@ -123,68 +128,46 @@ WRONG = {
         "expressions.grin: 'smlie' is not a channel, nor an expression of this head (smile, grin; roll",
     ),
     "channel's name": ({"expressions": {"yaw": "roll"}}, "expressions.yaw has the name of a channel"),
-    "mirror of nothing": (
-        {"joints": {"x": {"id": 9, "min_deg": 0, "max_deg": 1, "mirror_of": "lid"}}},
-        "joints.x.mirror_of = 'lid' is not a joint of this head (",
-    ),
-    "mirror of a mirror": (
-        {"joints": {"x": {"id": 9, "min_deg": 0, "max_deg": 1, "mirror_of": "lid_right"}}},
-        "joints.x.mirror_of = 'lid_right' is itself a mirror; name the joint that has the drive",
-    ),
-    "mirror and drive": (
-        {"joints": {"x": {"id": 9, "mirror_of": "beak", "drive": "yaw"}}},
-        "joints.x: has a drive and is mirror_of 'beak': one of them",
-    ),
-    "rest outside": ({"joints": {"x": {**OPENS, "rest_deg": 25}}}, "joints.x: rest_deg 25 is outside -10..20"),
-    "not a number": ({"joints": {"x": {**OPENS, "max_deg": math.nan}}}, "joints.x.max_deg = nan: Input should be"),
-    "infinite": ({"joints": {"x": {**OPENS, "max_deg": math.inf}}}, "joints.x.max_deg = inf: Input should be"),
-    "infinite gain": (
-        {"joints": {"x": {**OPENS, "drive": {"channel": "jawOpen", "gain": math.inf}}}},
-        "joints.x.drive.gain = inf: Input should be a finite",
-    ),
-    "two kinds": ({"joints": {"x": {**OPENS, "drive": {"sum": ["yaw"], "max": ["yaw"]}}}}, "sum, max"),
-    "empty sum": ({"joints": {"x": {**OPENS, "drive": {"sum": []}}}}, "drive.sum: Tuple should have at least 1"),
-    "clamp reversed": (
-        {"joints": {"x": {**OPENS, "drive": {"channel": "jawOpen", "clamp": [1, 0]}}}},
-        "joints.x.drive: clamp [1.0, 0.0] is reversed",
-    ),
+    "mirror of nothing": (x(mirror_of="lid"), "joints.x.mirror_of = 'lid' is not a joint of this head ("),
+    "mirror of a mirror": (x(mirror_of="lid_right"), "x.mirror_of = 'lid_right' is itself a mirror; name the joint"),
+    "mirror and drive": (x(mirror_of="beak", drive="yaw"), "x: has a drive and is mirror_of 'beak': one of them"),
+    "rest outside": (x(rest_deg=25), "joints.x: rest_deg 25 is outside -10..20"),
+    "not a number": (x(max_deg=math.nan), "joints.x.max_deg = nan: Input should be"),
+    "infinite": (x(max_deg=math.inf), "joints.x.max_deg = inf: Input should be"),
+    "infinite gain": (x(drive={"channel": "jawOpen", "gain": math.inf}), "joints.x.drive.gain = inf: Input should be"),
+    "two kinds": (x(drive={"sum": ["yaw"], "max": ["yaw"]}), "sum, max"),
+    "empty sum": (x(drive={"sum": []}), "drive.sum: Tuple should have at least 1"),
+    "clamp reversed": (x(drive={"channel": "jawOpen", "clamp": [1, 0]}), "x.drive: clamp [1.0, 0.0] is reversed"),
     "fold": (
         {"folds": [{"channel": "yaw", "into": "chin", "gain": 1}]},
         "folds.0.into = 'chin' is not a joint of this head (neck_yaw,",
     ),
     "coupling of nothing": (
-        {"couplings": [{"keep": {"beak": 1, "chin": 1}, "at_least": 0, "moving": ["beak"]}]},
+        {"couplings": [coupled("beak", beak=1, chin=1)]},
         "couplings.0.keep: 'chin' is not a joint of this head (neck_yaw,",
     ),
     "coupling without weight": (
-        {"couplings": [{"keep": {"beak": 1, "lid_left": 0}, "at_least": 0, "moving": ["lid_left"]}]},
+        {"couplings": [coupled("lid_left", beak=1, lid_left=0)]},
         "couplings.0: moving: 'lid_left' has no weight under keep (beak, lid_left)",
     ),
     "coupling that excludes rest": (
-        {"couplings": [{"keep": {"beak": 1, "lid_left": 1}, "at_least": 0.1, "moving": ["beak"]}]},
+        {"couplings": [coupled("beak", beak=1, lid_left=1, at_least=0.1)]},
         "couplings.0.at_least = 0.1: Input should be less than or equal to 0",
     ),
     "couplings that fight": (
-        {"couplings": [{"keep": {"beak": 1, "lid_left": 1}, "at_least": 0, "moving": ["beak"]},
-                       {"keep": {"beak": -1, "lid_right": 1}, "at_least": 0, "moving": ["lid_right"]}]},
+        {"couplings": [coupled("beak", beak=1, lid_left=1), coupled("lid_right", beak=-1, lid_right=1)]},
         "couplings.0.moving: 'beak' is also in couplings.1, one would undo the other",
     ),
-    "threshold of a fault that has no reading": (
-        {"faults": {"thresholds": {"shock": {"max": 1}}}},
-        "faults.thresholds.shock",
-    ),
+    "threshold without a reading": ({"faults": {"thresholds": {"shock": {"max": 1}}}}, "faults.thresholds.shock"),
     "two regions": (
         {"regions": {"a": {"joints": ["beak"]}, "b": {"joints": ["beak"]}}},
         "regions.b.joints: 'beak' is already in region a",
     ),
-    "knob": (
-        {"regions": {"a": {"joints": ["beak"], "style": 2.5}}},
-        "regions.a.style = 2.5: Input should be less than or equal to 2",
-    ),
+    "knob": ({"regions": {"a": {"joints": ["beak"], "style": 2.5}}}, "regions.a.style = 2.5: Input should be less"),
     "long product": ({"expressions": {"a": {"product": ["yaw"] * 5}}}, "a.product: Tuple should have at most 4 items"),
     "defaults": ({"joint_defaults": {"buss": "main"}}, "joint_defaults: 'buss' is not a known key (bus, model"),
     "life": ({"life": {"gaze": {"neck_gain": -1}}}, "life.gaze.neck_gain = -1: Input should be greater than or equal"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("change, told", WRONG.values(), ids=WRONG.keys())
@@ -205,11 +188,8 @@ def test_expressions_that_multiply_without_end_are_refused():
 
 def test_the_check_lists_all_wrong_values_then_all_contradictions(tmp_path):
     raw = added({"expressions": {"a": "b", "b": "a"}, "regions": {"r": {"joints": ["wing"]}}})
-    raw["kinematics"] = {
-        "kind": "serial",
-        "order": ["yaw", "pitch"],
-        "axes": {"yaw": "neck_yaw", "pitch": "neck_ptich"},
-    }
+    axes = {"yaw": "neck_yaw", "pitch": "neck_ptich"}
+    raw["kinematics"] = {"kind": "serial", "order": list(axes), "axes": axes}
     raw["joints"]["neck_yaw"]["bus"] = "mian"
     raw["joints"]["lid_right"]["id"] = 4
     contradictions = (
