@@ -72,8 +72,3 @@ def test_brows_and_hair_go_with_the_head_and_the_collar_stays():
     assert HEAD.rest[HAIR, 2].max() > REST[:, 2].max() + 0.005
     top = HEAD.rest[:, 2] > 0.10
     assert (np.linalg.norm(moved(HEAD, pitch=0.3)[top], axis=1) > 0.02).all()
-
-
-def test_no_hair_comes_out_of_the_neck():
-    neck = (HEAD.rest[:, 2] > -0.09) & (HEAD.rest[:, 2] < -0.045) & (HEAD.rest[:, 0] > 0.0)
-    assert not neck[HAIR].any()

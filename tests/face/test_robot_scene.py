@@ -7,7 +7,7 @@ import pytest
 
 from sfms_robot.app.catalogue import shipped_heads
 from sfms_robot.app.head.head_check import check
-from sfms_robot.app.head.head_scene import draw_scene, scene_of
+from sfms_robot.app.head.head_scene import scene_of
 from sfms_robot.config import load_head
 from sfms_robot.errors import ConfigError
 from sfms_robot.face.drawing import render_robots
@@ -140,10 +140,7 @@ def test_a_head_without_a_urdf_is_drawn_from_its_joints(name):
     "urdf, told",
     [
         ("owl2.urdf", "urdf.file = 'owl2.urdf' is neither a file nor a shipped head (face24_maestro, "),
-        (
-            "{file: owl.urdf, packages: {owl: parts}, joints: {jaw: Beak}}",
-            "urdf.joints.jaw.joint = 'Beak' is not a joint",
-        ),
+        ("{file: owl.urdf, packages: {owl: parts}, joints: {jaw: Beak}}", "joints.jaw.joint = 'Beak' is not a joint"),
         ("{file: owl.urdf, packages: {owl: parts}, joints: {jaw: stiff}}", "'stiff' does not move by itself"),
         ("{file: owl.urdf, joints: {tail: neck}}", "urdf.joints: 'tail' is not a joint of this head (jaw, neck)"),
         ("{file: owl.urdf, joints: {jaw: neck, neck: neck}}", "'neck' already follows jaw"),
@@ -269,16 +266,3 @@ def test_a_broken_mesh_is_one_line_of_ours_and_none_of_vtk(tmp_path, capfd, suff
     assert scene.left_out == [f"{scene.urdf}: link head: mesh filename: {file}: {said}: not drawn"]
     assert (tmp_path / "a.png").stat().st_size
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_robot_is_drawn_without_a_display_and_without_a_mesh_that_may_not_be_drawn(tmp_path):
-    pytest.importorskip("vtkmodules")
-    owl(tmp_path, "{file: owl.urdf, joints: {jaw: BeakJoint}}")
-    told = draw_scene(str(tmp_path), tmp_path / "a.png")
-    assert (tmp_path / "a.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-    assert "package://owl/head.stl" in told["left_out"][0]
-
-
-def test_the_two_inmoov_heads_are_one_robot():
-    texts = [scene_of(load_head(name)).urdf.read_text() for name in ("inmoov2_maestro", "inmoov2_ssc32")]
-    assert texts[0].replace("inmoov2_maestro", "") == texts[1].replace("inmoov2_ssc32", "")
