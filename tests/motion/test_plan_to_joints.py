@@ -7,7 +7,6 @@ from motion_rows import motions
 from sfms_robot.app.open_head import build_motion
 from sfms_robot.config import load_head
 from sfms_robot.frames import FRAME_S, Plan
-from sfms_robot.motion.limits import JerkLimiter, JointLimits
 from sfms_robot.runtime.loop import difference
 
 TICK_S, HORIZON, HOP, LATENCY_TICKS = 0.01, 8, 4, 2
@@ -64,19 +63,3 @@ def test_a_blink_closes_the_lid_although_it_is_faster_than_the_servo(closed_fram
     assert sent[:, LID].max() > (0.9 if closed_frames == 1 else 0.99) * closed
     assert sent[-1, LID] == pytest.approx(HEAD.joints["lid_left"].rest_rad, abs=1e-9)
     assert not sent[:, JOINTS.index("lid_right")].any()
-
-
-@pytest.mark.parametrize("from_shut_to_open", [False, True])
-def test_a_lid_that_can_closes_forty_degrees_in_under_80_ms(from_shut_to_open):
-    """900 deg/s; the other limits are those of the shipped face's lids."""
-    lid = HEAD.limits["lid"]
-    rates = np.radians([900.0, lid.acceleration_deg_s2, lid.jerk_deg_s3])
-    span = np.radians(40.0)
-    limiter = JerkLimiter(JointLimits(np.zeros(1), np.full(1, span), *rates[:, None]), TICK_S)
-    start, end = (span, 0.0) if from_shut_to_open else (0.0, span)
-    state, ticks = limiter.start(np.array([start])), 0
-    angle = start
-    while abs(angle - end) > np.radians(0.5):
-        goals, state = limiter.step(np.array([[end], [0.0], [0.0]]), state)
-        angle, ticks = float(goals[0]), ticks + 1
-    assert ticks * TICK_S < 0.080

@@ -139,12 +139,11 @@ def test_no_goal_is_refused_and_no_joint_goes_farther_out(name, size, chase, see
     tormented(Law(size(load_head(name)), chase), seed, kinds, 120)
 
 
-@pytest.mark.parametrize("chase", CHASES)
+@pytest.mark.parametrize(("name", "chase"), [("op3_head", StopChase), ("face28", TimeOptimalChase)])
 @pytest.mark.parametrize("size", SIZES, ids=["whole", "calibrate first", "sliver"])
-@pytest.mark.parametrize("name", ["op3_head", "face28"])
 @settings(max_examples=2)
 @given(seed=st.integers(0, 2**32 - 1), kinds=st.lists(st.sampled_from(KINDS), min_size=1, max_size=3))
-def test_every_joint_is_inside_its_range_in_the_stated_time_and_stays(name, size, chase, seed, kinds):
+def test_every_joint_is_inside_its_range_in_the_stated_time_and_stays(name, chase, size, seed, kinds):
     law, rng = Law(size(load_head(name)), chase), np.random.default_rng(seed)
     law.start(anywhere(rng, law.limits))
     everybody, latest_s = np.arange(law.count), law.due_s.max()

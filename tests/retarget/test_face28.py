@@ -32,11 +32,6 @@ def other_side(name: str) -> str:
     return name
 
 
-def test_twenty_five_face_joints_and_three_of_the_neck_with_ids_from_1():
-    assert len(JOINTS) == 28 and sum(name.startswith("neck_") for name in JOINTS) == 3
-    assert [joint.id for joint in HEAD.joints.values()] == list(range(1, 29))
-
-
 @given(st.integers(0, 2**32 - 1))
 def test_a_mirrored_face_gives_mirrored_joints(seed):
     rng = np.random.default_rng(seed)
@@ -56,38 +51,11 @@ def test_every_region_can_be_turned_to_rest():
     assert np.array(JOINTS)[MAPPING.angles(motion, still) != REST].size == 0
 
 
-def test_every_joint_but_the_sideways_tongue_is_driven_to_a_good_part_of_its_range():
-    rng = np.random.default_rng(0)
-    motion = rng.choice([0.0, 1.0], (400, MOTION_DIM)).astype(np.float32)
-    motion[:, :6] = rng.uniform(-1.1, 1.1, (400, 6))
-    angles = np.array([MAPPING.angles(row) for row in motion])
-    for name, span in zip(JOINTS, np.ptp(angles, axis=0), strict=True):
-        joint = HEAD.joints[name]
-        share = span / (joint.max_rad - joint.min_rad)
-        assert share == 0 if name == "tongue_side" else share > 0.75, name
-
-
 @pytest.mark.parametrize("joint", ["lid_left", "lid_right"])
 def test_a_lid_closes_with_a_blink_whatever_else_the_eye_does(joint):
     side, top = joint.removeprefix("lid_").capitalize(), HEAD.joints[joint].max_deg
     for other in ({}, {f"eyeLookUp{side}": 1.0}, {f"eyeWide{side}": 1.0}):
         assert angle_deg(joint, **{f"eyeBlink{side}": 0.86}, **other) == pytest.approx(top)
-
-
-@pytest.mark.parametrize(
-    "channels, closure",
-    [
-        ({"eyeBlinkLeft": 0.4}, 0.4),
-        ({"eyeLookDownLeft": 0.6}, 0.27),
-        ({"eyeSquintLeft": 0.5, "cheekSquintLeft": 0.5}, 0.29),
-        ({"eyeWideLeft": 0.5}, -0.175),
-        ({"eyeWideLeft": 0.5, "eyeBlinkLeft": 0.5}, 0.4125),  # widening gives way to a blink
-        ({"eyeLookUpLeft": 0.8}, -0.27),
-    ],
-)
-def test_the_upper_lid_adds_up_blink_squint_gaze_and_widening(channels, closure):
-    end_deg = HEAD.joints["lid_left"].max_deg if closure > 0 else -HEAD.joints["lid_left"].min_deg
-    assert angle_deg("lid_left", **channels) == pytest.approx(closure * end_deg, abs=1e-4)
 
 
 def test_the_lips_never_cross_whatever_the_mouth_does():

@@ -70,6 +70,22 @@ def test_what_the_neck_remembers_is_handed_through():
     assert turned[0] < 0.02 < turned[-1] < 0.3 and (np.diff(turned) > 0).all()
 
 
+def test_antennas_of_reachy_mini_rise_with_brows_and_smiles_and_fall_with_frowns_on_their_side():
+    retargeter = HeadRetargeter(load_head("reachy_mini"))
+
+    def raised(**face) -> list[float]:
+        turned = retargeter.angles(motion(**face)) - retargeter.angles(motion())
+        assert not turned[:7].any()  # body and legs follow the pose, not the face
+        return (turned[7:] * [1, -1]).tolist()
+
+    right, left = raised(browOuterUpLeft=1.0)
+    assert 0 < right < left and raised(browOuterUpRight=1.0) == pytest.approx([left, right])
+    assert min(raised(browInnerUp=1.0)) > 0 > max(raised(browDownLeft=1.0, browDownRight=1.0))
+    assert (
+        min(raised(mouthSmileLeft=1.0, mouthSmileRight=1.0)) > 0 > max(raised(mouthFrownLeft=1.0, mouthFrownRight=1.0))
+    )
+
+
 def test_a_rest_that_is_not_the_necks_home_is_told():
     head = load_head("reachy_mini")
     leg = head.joints["stewart_2"].model_copy(update={"rest_deg": -20.0})

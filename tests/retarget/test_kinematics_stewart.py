@@ -113,7 +113,7 @@ def neck(**body) -> Stewart:
     return built
 
 
-def smooth_path(seed: int, count: int = 2000) -> np.ndarray:
+def smooth_path(seed: int, count: int) -> np.ndarray:
     """A sum of a few slow waves, now inside the reach and now beyond it."""
     rng = np.random.default_rng(seed)
     phase = np.linspace(0, 2 * np.pi, count)[:, None] * np.arange(1, 4) + rng.uniform(0, 2 * np.pi, (6, 1, 3))
@@ -148,37 +148,20 @@ def test_the_reach_has_no_second_part_behind_its_border():
     assert (inside.sum(axis=1) == first_out).all()
 
 
-@settings(max_examples=10)
+@settings(max_examples=8)
 @given(seeds)
-def test_on_a_smooth_path_in_and_out_of_reach_no_step_is_longer_than_the_asked_one_allows(seed):
-    path = smooth_path(seed)
-    got, _ = NECK.nearest(path)
-    asked, made = distance_m(path[1:], path[:-1]), distance_m(got[1:], got[:-1])
-    assert (made <= LONGEST_STEP * asked).all()
-
-
-@settings(max_examples=5)
-@given(seeds)
-def test_nor_do_the_joints_jump(seed):
+def test_on_a_smooth_path_in_and_out_of_reach_neither_head_nor_joints_jump(seed):
     """A crank tip moves as far as the head, or some times as far where crank and rod are nearly in line."""
     path = smooth_path(seed, 1500)
+    got, asked_m = NECK.nearest(path)[0], distance_m(path[1:], path[:-1])
+    assert (distance_m(got[1:], got[:-1]) <= LONGEST_STEP * asked_m).all()
     tips_m = np.abs(np.diff(NECK.solve(path).angles_rad, axis=0)).max(axis=1) * CONFIG.crank_m
-    assert (tips_m <= LONGEST_STEP * distance_m(path[1:], path[:-1])).all()
+    assert (tips_m <= LONGEST_STEP * asked_m).all()
 
 
 def test_such_a_path_does_cross_the_border():
     shares = [NECK.solve(smooth_path(seed, 400)).reached.mean() for seed in range(8)]
     assert min(shares) < 0.7 and max(shares) > 0.3
-
-
-@pytest.mark.parametrize(
-    ("axis", "low", "high"), [("x", -0.0465, 0.0505), ("y", -0.0475, 0.0475), ("z", -0.0505, 0.023)]
-)
-def test_along_one_axis_the_platform_reaches_as_far_as_its_cranks_let_it(axis, low, high):
-    for sign, end in ((-1, low), (1, high)):
-        far = np.zeros(6)
-        far["xyz".index(axis) + 3] = sign * 0.2
-        assert NECK.nearest(far[None])[0][0] == pytest.approx(far / 0.2 * abs(end), abs=6e-4)
 
 
 @pytest.mark.parametrize(("column", "limit_deg"), [(0, 40), (1, 40), (2, 65)])

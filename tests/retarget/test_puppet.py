@@ -69,17 +69,10 @@ def test_channels_that_are_not_named_stay_the_listeners_and_a_stream_of_faces_ta
     assert len(puppet._pieces) <= 5
 
 
-asked_at = st.lists(
-    st.tuples(
-        st.integers(0, 150),
-        st.one_of(
-            st.tuples(st.just("show"), st.integers(1, 50), st.floats(0.02, 0.6)),
-            st.tuples(st.just("jaw"), st.floats(0, 1), st.floats(0.02, 0.6)),
-            st.tuples(st.just("look"), st.floats(-0.3, 0.3), st.floats(0.05, 0.6)),
-        ),
-    ),
-    max_size=12,
-)
+seconds = st.floats(0.02, 0.6)
+shows = st.tuples(st.just("show"), st.integers(1, 50), seconds) | st.tuples(st.just("jaw"), st.floats(0, 1), seconds)
+looks = st.tuples(st.just("look"), st.floats(-0.3, 0.3), st.floats(0.05, 0.6))
+asked_at = st.lists(st.tuples(st.integers(0, 150), shows | looks), max_size=12)
 
 
 @settings(phases=[Phase.explicit, Phase.reuse, Phase.generate])
