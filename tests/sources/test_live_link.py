@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.emulator.phone import EmulatedPhone, recorded_packets, renumbered
-from sfms_robot.endpoint import addresses_of_this_machine
-from sfms_robot.errors import NOTE, PacketError
+from sfms_robot.errors import PacketError
 from sfms_robot.frames import CHANNEL_INDEX, ORDERS, SHAPES
 from sfms_robot.sources.live_link import LiveLinkDecoder, motion_of, open_live_link, parse_packet
 
@@ -211,18 +210,6 @@ def test_an_emulated_phone_is_seen(sight):
     assert sight.statistics()["faces"] == 1 and sight.statistics()["lost"] == 0
 
 
-@pytest.mark.parametrize(("factor", "said"), [(1.0, ""), (180 / np.pi, "angles are taken as degrees")])
-def test_head_angles_are_radians_or_degrees_as_the_first_second_says(sight, factor, said, caplog):
-    shown = []
-    for number in range(120):
-        yaw = 0.1 * np.sin(number / 5) * factor
-        sight.feed(packet(number, (*FACE, yaw, 0.0, 0.0)), ("192.0.2.1", 1), number / 30)
-        seen = sight.at(number / 30)
-        shown += [seen.face.pose[2]] if seen else []
-    assert len(shown) == 90 and 0.05 < max(map(abs, shown)) < 0.25
-    assert sum(said in record.message for record in caplog.records if "(said once)" in record.message) == bool(said)
-
-
 def test_pose_channels_are_flipped_on_request():
     values, poses = np.zeros(61, np.float32), {}
     for flip in ("", ",flip=yaw+roll"):
@@ -235,19 +222,3 @@ def test_pose_channels_are_flipped_on_request():
         opened.close()
     assert poses[""] == pytest.approx([0.1, 0.2, 0.3], abs=0.02)
     assert poses[",flip=yaw+roll"] == pytest.approx([-0.1, 0.2, -0.3], abs=0.02)
-
-
-def test_the_log_says_what_to_type_in_the_app(caplog):
-    caplog.set_level(NOTE)
-    port = free_udp_port()
-    opened = open_live_link(str(port))
-    assert opened.address == ("127.0.0.1", port)
-    opened.close()
-    open_live_link(f"0.0.0.0:{port}").close()
-    alone, wider = [record.getMessage() for record in caplog.records]
-    assert {record.levelno for record in caplog.records} == {NOTE}  # a plain line
-    target = " or ".join(addresses_of_this_machine()) or "the address of this machine"
-    app = f"in the app, capture mode Live Link (ARKit), enter the target {target}, port {port}"
-    flag = f"--face live-link:0.0.0.0:{port}"
-    assert alone == f"live-link: 127.0.0.1, port {port}, this machine alone; for a phone {flag}, and {app}"
-    assert wider == f"live-link: {app}"

@@ -1,5 +1,7 @@
 """Pieces of a microphone in, frames of the loop out; time is an argument."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -108,21 +110,10 @@ def test_what_is_no_voice_is_turned_down_while_joints_move_and_passes_while_they
     assert levels[0] > 0.15 and levels[1] < 0.01
 
 
-class Sends(list):
-    """A worker that has sent these messages."""
-
-    def messages(self, now_s):
-        sent = list(self)
-        self.clear()
-        return sent
-
-    def statistics(self):
-        return {"state": "running"}
-
-
 def test_what_is_wrong_with_a_device_is_logged_once_in_the_run(caplog):
     slow = {"mix": "", "pace": "cheap: gives 0.90 s of sound a second"}
-    sends = Sends(["cheap", {"pace": 0.9, LINES: slow}, {"pace": 0.91, LINES: {**slow, "pace": "cheap: gives 0.91 s"}}])
-    microphone = Microphone(sends)
+    told = ["cheap", {"pace": 0.9, LINES: slow}, {"pace": 0.91, LINES: {**slow, "pace": "cheap: gives 0.91 s"}}]
+    sent = iter([told])
+    microphone = Microphone(SimpleNamespace(messages=lambda now_s: next(sent, []), statistics=dict))
     assert [record.getMessage() for record in caplog.records] == [f"{slow['pace']} (said once)"]
     assert microphone.statistics()["pace"] == 0.91 and LINES not in microphone.statistics()

@@ -65,10 +65,7 @@ def test_a_hello_says_what_it_feeds_and_wants():
         (b"RIFF" + bytes(99), "a WAV file: sound comes in"),
         (HEADER.pack(VOICE, 1, 0, 16000, 0, 0) + b"RIFF" + bytes(40), "a WAV file behind the header: send its samples"),
         (b'{"type": "session.update", "session": {}}', "'session.update' is an event of the OpenAI Realtime API"),
-        (
-            b'{"event_id": "e", "type": "input_audio_buffer.append", "audio": "' + b"A" * 9000 + b'"}',
-            "'input_audio_buffer.append' is an event of the OpenAI Realtime API, .*: sound comes in binary messages",
-        ),
+        (b'{"type": "input_audio_buffer.append", "audio": "' + b"A" * 9000 + b'"}', "Realtime API, .*: sound comes in"),
         (HEADER.pack(VOICE, 2, 0, 16000, 0, 0), "version 2, not 1"),
         (HEADER.pack(9, 1, 0, 16000, 0, 0), r"kind 9, which a robot is not sent \(voice, face, speech\)"),
         (HEADER.pack(VOICE, 1, 7, 16000, 0, 0), "kind 1"),
@@ -84,10 +81,7 @@ def test_a_hello_says_what_it_feeds_and_wants():
         (b"{" + b" " * 5000, "JSON of more than 4096 bytes"),
         (b'{"type": "halt"}', "Input tag 'halt' .* expected tags: 'hello', 'hush'"),
         (b'{"type": "hello", "version": 2}', "hello.version = 2: Input should be 1"),
-        (
-            b'{"type": "hello", "version": 1, "feeds": ["voices"]}',
-            "hello.feeds.0 = 'voices': Input should be 'voice', 'face' or 'speech'",
-        ),
+        (b'{"type": "hello", "version": 1, "feeds": ["voices"]}', "hello.feeds.0 = 'voices': Input should be 'voice'"),
         (b'{"type": "hello", "version": 1, "name": "a\\nb"}', "hello.name = .* printable"),
     ],
 )
@@ -113,7 +107,7 @@ def parses(data):
         return None
 
 
-@pytest.mark.parametrize("count", [20_000, pytest.param(300_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [20_000, pytest.param(100_000, marks=pytest.mark.slow)])
 def test_random_messages_raise_nothing_else_and_what_is_read_is_finite(count):
     rng, read = np.random.default_rng(count), 0
     good = [

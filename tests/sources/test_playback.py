@@ -1,8 +1,8 @@
 """`--play` in virtual time: what leaves the device at an instant is what is due then, and everything goes by it."""
 
 import math
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -333,20 +333,16 @@ def test_threads_that_speak_and_hush_do_not_hold_up_the_loop():
     voice = PlayedVoice(VirtualLoudspeaker(), spoken)
     spoken.played_by(voice)
     voice.start(time.monotonic())
-    over = threading.Event()
 
     def speak():
-        while not over.is_set():
+        for _ in range(200):
             spoken.say(noise(0.02), AUDIO_HZ)
             spoken.hush()
 
-    threads = [threading.Thread(target=speak) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    taken = [voice.take(index) for index in range(1000)]
-    over.set()
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(2) as threads:
+        speakers = [threads.submit(speak) for _ in range(2)]
+        taken = [voice.take(index) for index in range(1000)]
+    assert not any(each.exception() for each in speakers)
     assert all(frame is None or frame.shape == (FRAME_SAMPLES,) for frame in taken)
 
 

@@ -1,6 +1,6 @@
 """A person handed over by calls: what comes out is what went in, on a grid that never slips."""
 
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -131,17 +131,6 @@ def test_a_caller_that_is_faster_than_time_fills_no_memory_and_delays_only_until
     assert person.source.statistics()["voice"]["dropped"] == 20 * 32000
     person.voice.hear(np.zeros(320), 16000)
     assert person.voice.statistics()["delay_ms"] == 20.0
-
-
-def test_a_program_that_falls_behind_is_named_once(caplog):
-    person = Person()
-    for index in range(600):
-        person.read(index * 0.023)
-        person.voice.hear(np.zeros(320), 16000)
-    assert [record.getMessage() for record in caplog.records] == [
-        "hear(): sound comes at 0.87 of real time: its sender falls behind; pace it by the clock (said once)"
-    ]
-    assert person.source.statistics()["voice"]["pace"] == pytest.approx(0.87, abs=0.001)
 
 
 def test_bursts_are_named_and_then_heard_whole(caplog):
@@ -299,24 +288,18 @@ def test_a_voice_with_times_is_placed_by_them():
 
 
 def test_calls_may_come_from_any_thread():
-    person, raised = Person(), []
+    person = Person()
 
     def speak() -> None:
-        try:
-            for _ in range(50):
-                person.voice.hear(np.full(160, 0.25), 16000)
-                person.speech.say(np.full(160, 0.25), 16000)
-                person.sight.see(np.zeros(58))
-        except Exception as error:
-            raised.append(error)
+        for _ in range(50):
+            person.voice.hear(np.full(160, 0.25), 16000)
+            person.speech.say(np.full(160, 0.25), 16000)
+            person.sight.see(np.zeros(58))
 
-    threads = [threading.Thread(target=speak) for _ in range(4)]
-    for thread in threads:
-        thread.start()
-    frames = [frame for n in range(1, 20) for frame in person.source.read(n / 25)]
-    for thread in threads:
-        thread.join()
+    with ThreadPoolExecutor(4) as threads:
+        speakers = [threads.submit(speak) for _ in range(4)]
+        frames = [frame for n in range(1, 20) for frame in person.source.read(n / 25)]
+    assert not any(each.exception() for each in speakers)
     frames += person.source.read(20.0)
     said = np.concatenate([frame.agent_audio for frame in frames if frame.agent_audio is not None])
-    assert not raised
     assert np.count_nonzero(said) + person.speech.statistics()["late"] == 4 * 50 * 160

@@ -8,14 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recorded_sound import recorded_voice
 
-from sfms_robot.data import speaker_names
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_SAMPLES
 from sfms_robot.signals.audio import read_audio
-from sfms_robot.signals.tracks import Track, write_track
+from sfms_robot.signals.tracks import Track
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.recording import RecordedSight
-from sfms_robot.sources.registry import open_source, shipped_speaker
+from sfms_robot.sources.registry import open_source
 
 
 def recorded(audio, track, duration_s=None, loop=True, agent_audio=None):
@@ -70,30 +69,6 @@ def test_a_short_voice_starts_again_after_a_second_of_silence_and_without_loop_n
 def test_a_run_needs_a_length(duration_s):
     with pytest.raises(ConfigError, match="--duration"):
         recorded(None, None, duration_s)
-
-
-def test_shipped_speakers_can_be_heard_and_seen():
-    assert {"facegood_1114_3_16", "katie"} <= set(speaker_names())
-    default = open_source()
-    frames = default.read(10.0)
-    assert default.duration_s == pytest.approx(47.68) and len(frames) == 250
-    jaw = [frame.face.blendshapes[24] for frame in frames if frame.face is not None]
-    level = [float(np.abs(frame.audio).mean()) for frame in frames]
-    assert np.corrcoef(jaw, level)[0, 1] > 0.4
-    assert all(frame.face is None for frame in open_source("katie").read(20.0))
-    assert shipped_speaker("katie").face is None
-    source = open_source("none", "none", agent_audio=speaker_names()[0])
-    assert any(frame.agent_audio.any() for frame in source.read(5.0))
-
-
-def test_files_are_opened_by_path(tmp_path):
-    soundfile.write(tmp_path / "a.wav", np.full(44100, 0.1), 44100)
-    write_track(tmp_path / "a.csv", face(0.5))
-    frames = open_source(str(tmp_path / "a.wav"), str(tmp_path / "a.csv"), duration_s=1.0).read(1.0)
-    assert len(frames) == 25 and frames[5].audio[0] == pytest.approx(0.1, abs=0.01)
-    assert frames[5].face is not None and frames[-1].face is None
-    assert open_source(str(tmp_path / "a.wav"), "none").read(1.0)[0].face is None
-    assert len(open_source(face=str(tmp_path / "a.csv")).read(1.0)[0].audio) == 0
 
 
 def test_the_robots_voice_comes_one_frame_early_and_silence_follows():

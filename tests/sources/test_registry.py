@@ -46,14 +46,6 @@ def install(tmp_path, monkeypatch):
     return installed
 
 
-def test_a_kind_gets_what_stands_behind_the_colon_and_is_closed(install):
-    inner, told = Own(), []
-    install(ear=lambda argument: told.append(argument) or inner)
-    source = open_source("ear:left:2")
-    source.close()
-    assert told == ["left:2"] and inner.closed
-
-
 @pytest.mark.parametrize("audio", ["push:0", "katie", "none", "ear"])
 @pytest.mark.parametrize("face", ["push:0", "none", FACE, "eye"])
 @pytest.mark.parametrize("agent_audio", ["katie", "none"])

@@ -61,26 +61,16 @@ def test_a_face_is_seen_through_its_action_units(router, argument, hashed):
         assert sight.lost
 
 
-UNITS = to_cdr(ACTION_UNITS, units_of(face(jawOpen=0.5)))
+UNITS, WIRE = to_cdr(ACTION_UNITS, units_of(face(jawOpen=0.5))), wire_name(ACTION_UNITS)
+KIND, _, HASH = WIRE.partition("/")
+BROKEN = units_of(face(jawOpen=0.5)) | {"intensity": np.full(99, np.nan)}
 BAD = {
     "another type": (wire_name(STRING), to_cdr(STRING, {"data": "smile"}), f"expected {ACTION_UNITS}, got {STRING}"),
-    "another version": (
-        wire_name(ACTION_UNITS).replace("RIHS01_", "RIHS01_f"),
-        UNITS,
-        f"{ACTION_UNITS}: expected {wire_name(ACTION_UNITS).split('/')[1]}, got RIHS01_f",
-    ),
-    "cut off": (wire_name(ACTION_UNITS), UNITS[:-40], f"{ACTION_UNITS}: confidence: expected 396 bytes, got 356"),
-    "no CDR": (f"{wire_name(ACTION_UNITS).split('/')[0]}/{NO_HASH}", b"{}", "expected CDR, little-endian"),
-    "not finite": (
-        wire_name(ACTION_UNITS),
-        to_cdr(ACTION_UNITS, units_of(face(jawOpen=0.5)) | {"intensity": np.full(99, np.nan)}),
-        "roll is not finite",
-    ),
-    "too large": (
-        wire_name(ACTION_UNITS),
-        to_cdr(ACTION_UNITS, {"intensity": [100] * 99, "confidence": [1] * 99}),
-        "100",
-    ),
+    "another version": (WIRE.replace("RIHS01_", "RIHS01_f"), UNITS, f"{ACTION_UNITS}: expected {HASH}, got RIHS01_f"),
+    "cut off": (WIRE, UNITS[:-40], f"{ACTION_UNITS}: confidence: expected 396 bytes, got 356"),
+    "no CDR": (f"{KIND}/{NO_HASH}", b"{}", "expected CDR, little-endian"),
+    "not finite": (WIRE, to_cdr(ACTION_UNITS, BROKEN), "roll is not finite"),
+    "too large": (WIRE, to_cdr(ACTION_UNITS, {"intensity": [100] * 99, "confidence": [1] * 99}), "100"),
 }
 
 
@@ -90,7 +80,7 @@ def test_a_message_that_cannot_be_used_is_one_line_and_the_next_one_is_seen(rout
         sight.start(time.monotonic())
         for _ in range(2):
             send(sight, router, FACS, wire, data, "refused")
-        send(sight, router, FACS, wire_name(ACTION_UNITS), UNITS)
+        send(sight, router, FACS, WIRE, UNITS)
         assert sight.at(1000.0) is not None
     (line,) = [line for line in caplog.messages if "left out" in line]
     assert line.startswith(f"sfms_robot_face: {FACS}: left out: ") and problem in line and "\n" not in line
@@ -128,7 +118,7 @@ def test_a_router_that_comes_late_goes_and_comes_back_is_found_again(tmp_path):
     with closing(Ros2Sight("23bd5", router)) as sight:
         for _ in range(2):
             with serving(endpoint):
-                send(sight, router, FACS, wire_name(ACTION_UNITS), UNITS)
+                send(sight, router, FACS, WIRE, UNITS)
         assert sight.statistics() == {"sent": 0, "received": 2, "refused": 0}
 
 

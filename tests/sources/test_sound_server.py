@@ -121,28 +121,6 @@ def test_what_is_played_is_what_is_heard(hear, play, tmp_path):
     assert 0.0 < hearing.microphone.latency_s < 1.0
 
 
-@pytest.mark.slow
-def test_an_unplugged_microphone_is_lost_and_comes_back(hear, sound_server, caplog):
-    caplog.set_level(logging.INFO, "sfms_robot")
-    hearing = hear("mic:person.monitor")
-    hearing.seconds(0.4)
-    assert not hearing.microphone.lost
-    sound_server.unplug("person")
-    hearing.until(lambda: hearing.microphone.lost)
-    silent = hearing.seconds(0.4)
-    assert not any(len(frame.audio) for frame in silent)
-    sound_server.plug("person")
-    hearing.until(lambda: not hearing.microphone.lost)
-    again = hearing.seconds(1.0)
-    assert any(len(frame.audio) for frame in again)
-    assert [frame.time_s for frame in hearing.frames] == pytest.approx(FRAME_S * np.arange(1, len(hearing.frames) + 1))
-    assert [record.getMessage() for record in caplog.records] == [
-        "microphone: person.monitor",
-        "microphone: person.monitor gives no more sound; restarting",
-        "microphone: running again",
-    ]
-
-
 def called(seconds, said):
     """A loud noise, silence until `seconds` after its beginning, then what is said."""
     noise = 0.5 * np.random.default_rng(1).standard_normal(AUDIO_HZ // 10).clip(-1, 1)
@@ -156,7 +134,7 @@ def heard_loud_s(hearing):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("told_by", ["file", "device", "program"])
+@pytest.mark.parametrize("told_by", ["device", "program"])
 def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_server, tmp_path, told_by):
     """Its loudspeaker is heard by the microphone 50 ms later; nobody else speaks.
 
@@ -164,17 +142,12 @@ def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_ser
     a second before it will be heard.
     """
     said = read_audio(data_dir("sim") / "speakers" / "katie" / "speech.flac")[: 6 * AUDIO_HZ]
-    soundfile.write(tmp_path / "said.wav", said, AUDIO_HZ)
     soundfile.write(tmp_path / "played.wav", called(CALLED_S, said), AUDIO_HZ)
     sound_server.plug("robot")
     sound_server.load("module-loopback", "source=robot.monitor", "sink=person", "latency_msec=50")
     speech = PushedSpeech()
-    how = {
-        "file": {"agent_audio": str(tmp_path / "said.wav")},
-        "device": {"agent_audio": "device:robot.monitor"},
-        "program": {"agent": speech},
-    }
-    ear, hearing = hear("mic:person.monitor"), hear("mic:person.monitor", **how[told_by])
+    told = {"agent_audio": "device:robot.monitor"} if told_by == "device" else {"agent": speech}
+    ear, hearing = hear("mic:person.monitor"), hear("mic:person.monitor", **told)
     player = play("robot", tmp_path / "played.wav")
     ear.until(lambda: heard_loud_s(ear) is not None)
     told_s = heard_loud_s(ear) + CALLED_S - 0.1
@@ -250,30 +223,25 @@ def test_what_is_told_to_leave_is_what_is_recorded_then(sound_server):
 
 
 @pytest.mark.slow
-def test_a_loudspeaker_that_was_unplugged_is_found_again(sound_server, caplog):
+def test_a_microphone_and_a_loudspeaker_that_were_unplugged_are_lost_and_come_back(hear, sound_server, caplog):
     caplog.set_level(logging.INFO, "sfms_robot")
-    said = noise(60.0)
-    with closing(open_source("none", "none", agent=recorded_voice(said), play="person")) as source:
-        origin_s = time.monotonic()
-        source.start(origin_s)
-        frames = []
+    hearing = hear("mic:person.monitor", agent=recorded_voice(noise(60.0)), play="person")
 
-        def until(enough):
-            before = len(frames)
-            while not enough(frames[before:]):
-                assert time.monotonic() < origin_s + PATIENCE_S
-                frames.extend(source.read(time.monotonic() - origin_s))
-                pause(source._agent)
+    def both(frames):
+        return any(len(each.audio) and each.agent_audio is not None and each.agent_audio.any() for each in frames)
 
-        until(lambda new: any(frame.agent_audio is not None and frame.agent_audio.any() for frame in new))
-        sound_server.unplug("person")
-        until(lambda _: "agent_audio" in source.missing)
-        until(lambda new: len(new) > 5 and not any(frame.agent_audio.any() for frame in new[-3:]))
-        sound_server.plug("person")
-        until(lambda _: not source.missing)
-        until(lambda new: any(frame.agent_audio.any() for frame in new))
+    hearing.until(lambda: both(hearing.frames))
+    sound_server.unplug("person")
+    hearing.until(lambda: set(hearing.source.missing) == {"voice", "agent_audio"})
+    assert not any(len(frame.audio) or frame.agent_audio.any() for frame in hearing.seconds(0.4)[-3:])
+    sound_server.plug("person")
+    hearing.until(lambda: not hearing.source.missing)
+    back = len(hearing.frames)
+    hearing.until(lambda: both(hearing.frames[back:]))
+    assert [frame.time_s for frame in hearing.frames] == pytest.approx(FRAME_S * np.arange(1, len(hearing.frames) + 1))
     told = [record.getMessage() for record in caplog.records]
-    assert told[0].startswith("loudspeaker: person, ") and told[-1] == "loudspeaker: running again"
+    assert "microphone: person.monitor gives no more sound; restarting" in told
+    assert {"microphone: running again", "loudspeaker: running again"} <= set(told)
 
 
 def test_a_loudspeaker_that_is_not_there_is_one_line_with_the_choices(sound_server):
@@ -306,9 +274,7 @@ def test_what_it_plays_is_taken_out_of_what_it_hears(sound_server, tmp_path):
             frames += one.read(time.monotonic() - origin_s)
             pause(one._agent)
     settled = [frame for frame in frames[75:] if len(frame.audio) and frame.agent_audio.any()]
-    heard, own = (
-        [energy_db(part) for part in parts]
-        for parts in ([frame.audio for frame in settled], [frame.agent_audio for frame in settled])
-    )
+    heard = [energy_db(frame.audio) for frame in settled]
+    own = [energy_db(frame.agent_audio) for frame in settled]
     # Frame by frame: on a busy computer the sound server drops some, and the canceller needs a moment after each.
     assert np.median(own) > -40.0 and np.median(heard) < np.median(own) - 15.0

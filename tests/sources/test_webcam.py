@@ -197,17 +197,11 @@ def test_a_person_is_left_only_for_one_clearly_nearer_or_once_gone_and_followed_
     assert all(place[0] == 0.6 for place in followed(walk))
 
 
-@pytest.mark.parametrize(
-    "moment",
-    [
-        (
-            [[LEFT, 0.9 * camera_source.NEARER * RIGHT]] * round(0.8 * camera_source.TAKE_OVER_S / STEP_S)
-            + [[LEFT, RIGHT]]
-        )
-        * 5,  # leans in
-        [[RIGHT]] * round(0.8 * camera_source.GONE_S / STEP_S) + [[RIGHT, LEFT]] * 5,  # the chosen one is hidden
-    ],
-)
+LEANS_IN = [[LEFT, 0.9 * camera_source.NEARER * RIGHT]] * round(0.8 * camera_source.TAKE_OVER_S / STEP_S)
+HIDDEN = [[RIGHT]] * round(0.8 * camera_source.GONE_S / STEP_S)  # the chosen one
+
+
+@pytest.mark.parametrize("moment", [(LEANS_IN + [[LEFT, RIGHT]]) * 5, HIDDEN + [[RIGHT, LEFT]] * 5])
 def test_a_moment_changes_nothing(moment):
     assert all(place is LEFT or place is None for place in followed([[LEFT, RIGHT]] + moment))
 
