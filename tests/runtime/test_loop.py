@@ -63,12 +63,6 @@ def test_torque_comes_on_without_a_jump_and_the_face_eases_in(chain: Chain) -> N
     assert np.abs(np.diff([tick.goals_rad[row] for tick in ticks[:20]])).max() < 0.005
 
 
-def test_the_head_follows_the_listener(chain: Chain) -> None:
-    ticks = run(chain, nodder()).watcher.ticks
-    pitches = [tick.readings["neck_pitch"].position_rad for tick in ticks if tick.time_s > 1.2]
-    assert max(p for p in pitches if p is not None) == pytest.approx(0.1, abs=0.01)
-
-
 def test_a_plan_that_is_not_finite_is_refused_and_the_face_stays_safe(chain: Chain) -> None:
     ran = run(chain, nodder(nan_from=20))
     assert ran.outcome == "done" and ran.log.refused_plans > 0

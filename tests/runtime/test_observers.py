@@ -56,23 +56,6 @@ def test_the_person_is_what_the_newest_frame_holds() -> None:
     assert status.document()["person"] == {"voice_db": None, "seen": False, "attention": None, "own_voice_db": None}
 
 
-@pytest.mark.parametrize(
-    ("state", "why", "says"),
-    [
-        ("listening", (), None),
-        ("degraded", ("voice", "jaw"), "without voice, jaw"),
-        ("halted", ("key",), "until every cause is cleared"),
-        ("idle", (), "no person is seen or heard"),
-        ("fault", ("the supply is gone",), "the supply is gone"),
-    ],
-)
-def test_it_says_why_something_is_not_followed(state: str, why: tuple[str, ...], says: str | None) -> None:
-    status = RunStatus(JOINTS, {})
-    status.tick(tick(state, why))
-    note = status.document()["note"]
-    assert note is None if says is None else says in note
-
-
 @pytest.mark.parametrize("error", [None, "torque of jaw could not be confirmed off"])
 def test_after_the_end_it_shows_the_last_state_and_joints_whose_torque_is_not_confirmed_off(error) -> None:
     status = RunStatus(JOINTS, {}, lambda: {"torque_unconfirmed": ["jaw"] if error else []})

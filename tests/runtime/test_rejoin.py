@@ -41,17 +41,3 @@ def test_joint_that_came_back_eases_in_from_where_it_stands():
     others = np.delete(goals, pitch, axis=1)
     assert np.abs(np.diff(others[190:], axis=0)).max() < 1e-3  # they stood still all the while
     assert ticks[-1].readings["neck_pitch"].position_rad == pytest.approx(bowed, abs=0.01)
-
-
-def test_head_comes_back_whole_after_its_adapter_was_unplugged():
-    with launch(emulated(HEAD)["main"], virtual=True) as chain:
-        ran, ticks = run(chain, {149: chain.hang_up, 249: chain.come_back}, 7.0)
-        torque = [chain.state(joint.id)["torque"] for joint in HEAD.joints.values()]
-    assert ran.outcome == "done" and ran.log.audited.violations == 0
-    ages = np.array([[each.age_s for each in tick.readings.values()] for tick in ticks])
-    assert (ages[155:249] > 0).all()
-    assert (ages[450:] == 0.0).all()  # 2 s after it was plugged in again
-    last = ticks[-1]
-    for name, reading in last.readings.items():
-        assert reading.position_rad == pytest.approx(last.goals_rad[JOINTS.index(name)], abs=0.01), name
-    assert not any(torque)

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfms_robot.frames import Reading
 from sfms_robot.runtime import safety
 
 
@@ -91,9 +90,3 @@ def test_a_hot_joint_is_at_rest_after_two_seconds_and_comes_back_when_it_has_coo
             heat = guard.after(guard.judge(np.array([degrees, 20.0, 20.0]), heat), 0.01)
         assert np.allclose(heat.share, [shown, 1.0, 1.0])
     assert heat.none
-
-
-def test_temperatures_are_read_where_they_are_told() -> None:
-    readings = {"a": Reading(0.0, 0.0, extra={"temperature_C": 41.0}), "b": Reading(0.0, 0.0)}
-    assert safety.temperatures_C(["a", "b", "c"], readings)[0] == 41.0
-    assert np.isnan(safety.temperatures_C(["a", "b", "c"], readings)[1:]).all()
