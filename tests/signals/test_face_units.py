@@ -10,9 +10,6 @@ from sfms_robot.signals import face_units
 @pytest.mark.parametrize(
     ("name", "channel"),
     [
-        ("eyeBlink_L", "eyeBlinkLeft"),
-        ("EYEBLINKRIGHT", "eyeBlinkRight"),
-        ("BlendShape.mouthSmile_R", "mouthSmileRight"),
         ("brow_inner_up", "browInnerUp"),
         ("jawL", "jawLeft"),
         ("tongueOut", "tongueOut"),

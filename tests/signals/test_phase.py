@@ -94,9 +94,3 @@ def test_hats_add_up_to_one_and_reproduce_knots(speech_s, silence_s, last_s):
     assert row.min() >= 0 and row[:a].sum() == pytest.approx(float(speech_s > 0), abs=1e-6)
     assert row[a:b].sum() == pytest.approx(1, abs=1e-6)
     assert row[b:].sum() == pytest.approx(float(last_s > 0), abs=1e-6)
-
-
-@pytest.mark.parametrize("index", range(len(SILENCE_KNOTS_S)))
-def test_a_time_on_a_knot_is_that_knot_alone(index):
-    row = phase.features(np.array([[0.0, SILENCE_KNOTS_S[index], 0.0]]))[0]
-    assert row[len(SPEECH_KNOTS_S) + index] == pytest.approx(1) and row.sum() == pytest.approx(1)
