@@ -26,12 +26,12 @@ def trained(name: str) -> Any:
 
 
 def off(part: str, keys: str) -> dict[str, None]:
-    """Keys of a part that are switched off."""
+    """Return the keys of a part, each switched off."""
     return dict.fromkeys(f"{part}.{key}" for key in keys.split())
 
 
 def holds(one: Any, wanted: Any) -> bool:
-    """Whether the keys have these values (None: 0, False or none at all), or what is asked of the whole is so."""
+    """Return whether the keys have these values (None stands for 0 and False too), or a rule of the whole holds."""
     if callable(wanted):
         return bool(wanted(one))
     found = {key: attrgetter(key)(one) or None for key in wanted}

@@ -104,7 +104,7 @@ def test_every_shipped_file_names_its_schema_in_the_first_line(pattern):
 
 
 def x(**joint) -> dict:
-    """The joint x, and what else it has."""
+    """Return a head that has a joint x with these keys."""
     return {"joints": {"x": {"id": 9, "min_deg": -10, "max_deg": 20, **joint}}}
 
 

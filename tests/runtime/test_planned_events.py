@@ -41,7 +41,7 @@ def plans_of(motion, hop, horizon):
 
 
 @pytest.mark.parametrize(("hop", "horizon"), [(4, 8), (1, 1), (2, 8)])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_every_event_is_told_once_whatever_the_horizon(hop, horizon, seed):
     motion = face_of(60, seed)
     found, heard = PlannedEvents(), []

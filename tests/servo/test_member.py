@@ -74,7 +74,7 @@ def refuses(member, failure=None):
 
 
 def mute_again(member):
-    """It is silent once more while it comes back at 1 s."""
+    """Fall silent once more while it comes back at 1 s."""
     silent(member)
     member.back(1.0)
     refuses(member, Silent("no answer"))
