@@ -67,12 +67,3 @@ def test_the_lips_never_cross_whatever_the_mouth_does():
     for part in ("left", "right", "centre"):
         gap = column[f"lip_upper_{part}"] + column[f"lip_lower_{part}"] + column["jaw"]
         assert gap.min() >= -0.3 - 1e-9, part
-
-
-def test_the_neck_is_the_pose_and_smiles_and_frowns_move_corners_and_cheeks():
-    assert angle_deg("neck_pitch", pitch=np.radians(10)) == pytest.approx(10, abs=1e-4)
-    assert angle_deg("neck_yaw", yaw=np.radians(-20)) == pytest.approx(-20, abs=1e-4)
-    assert angle_deg("neck_roll", roll=np.radians(40)) == pytest.approx(HEAD.joints["neck_roll"].max_deg)
-    assert angle_deg("corner_left", mouthSmileLeft=1.0) == pytest.approx(HEAD.joints["corner_left"].max_deg)
-    assert angle_deg("cheek_left", mouthSmileLeft=1.0) > 0 == angle_deg("corner_right", mouthSmileLeft=1.0)
-    assert angle_deg("corner_left", mouthFrownLeft=1.0) < 0
