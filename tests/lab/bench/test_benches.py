@@ -14,7 +14,7 @@ from torch.nn.functional import scaled_dot_product_attention
 from sfms_robot.errors import BusError, ConfigError
 from sfms_robot.lab import bench
 from sfms_robot.lab.bench import BENCHES, Bench, measure_all, run_bench
-from sfms_robot.lab.bench.measure import BenchResult, environment, row, write_page
+from sfms_robot.lab.bench.measure import environment, row
 from sfms_robot.lab.bench.operation_count import OperationCount
 from sfms_robot.lab.learning import train_runs
 
@@ -40,17 +40,6 @@ def test_a_training_step_is_timed_with_and_without_its_model():
     assert all(0 < each["ratio"] < 1 for each in found.figures.values())
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="here is a GPU")
-def test_serve_on_a_gpu_is_refused_without_one():
-    with pytest.raises(ConfigError, match="--device cuda: torch sees no CUDA device here"):
-        run_bench("serve", {"device": "cuda"}, quiet)
-
-
-def test_a_bench_that_is_none_is_told_those_that_are():
-    with pytest.raises(ConfigError, match=r'there is no "bos" \(all, startup, bus, .*campaign'):
-        run_bench("bos", {}, quiet)
-
-
 @pytest.mark.parametrize(
     ("name", "given", "said"),
     [
@@ -61,15 +50,6 @@ def test_a_bench_that_is_none_is_told_those_that_are():
 def test_an_option_that_means_nothing_there_is_refused(name, given, said):
     with pytest.raises(ConfigError, match=said):
         run_bench(name, given, quiet)
-
-
-def test_a_page_has_every_row_and_says_where_it_was_measured(tmp_path):
-    rows = BenchResult.of_rows({"bus.tick": row([1.0, 2.0], [4.0], "ms", "somebody")}).figures
-    write_page(tmp_path / "page.md", {**rows, "notes": "no row"}, 1.5)
-    page = (tmp_path / "page.md").read_text()
-    assert "| bus.tick | 1.5 ms | 1.99 | 0.375 | somebody | 2 |" in page and "in 1.5 minutes" in page
-    with pytest.raises(ConfigError, match="cannot be written"):
-        write_page(tmp_path / "nowhere" / "page.md", rows, 1.0)
 
 
 def test_a_bench_that_fails_does_not_cost_the_others_their_rows(monkeypatch):

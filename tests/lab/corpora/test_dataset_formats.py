@@ -301,12 +301,6 @@ def test_bad_arguments_are_one_clear_line(change, message, tmp_path):
         open_dataset(tmp_path, **({"split": "train"} | change))
 
 
-def test_order_of_files_that_name_their_channels_is_refused(tmp_path):
-    write.dualtalk(tmp_path)
-    with pytest.raises(ConfigError, match="there is no order to choose"):
-        open_dataset(tmp_path, "train", order="pose-first")
-
-
 def test_folder_of_nothing_known_lists_what_is_known(tmp_path):
     with pytest.raises(ConfigError, match=r"no data set that is known here: l2l \(.*composed \("):
         open_dataset(tmp_path, "train")
@@ -315,24 +309,6 @@ def test_folder_of_nothing_known_lists_what_is_known(tmp_path):
     (tmp_path / "a.zip").write_bytes(b"PK")
     with pytest.raises(ConfigError, match=r"expected a folder, got a file \(unpack an archive first\)"):
         open_dataset(tmp_path / "a.zip", "train")
-
-
-def test_manual_and_help_name_every_layout_as_it_is():
-    manual = (Path(__file__).parents[3] / "docs" / "guide" / "data.md").read_text(encoding="utf-8")
-    rows = {line.split("|")[1].strip(" `"): line for line in manual.splitlines() if line.startswith("| `")}
-    for name, layout in LAYOUTS.items():
-        assert f"`{layout.space}`" in rows[name] and f"| {layout.fps:g} |" in rows[name]
-    help_text = (Path(formats.__file__).parents[2] / "cli" / "train_command.py").read_text(encoding="utf-8")
-    assert all(name in help_text for name in LAYOUTS)
-
-
-@pytest.mark.parametrize("name", ["l2l", "react", "dim"])
-def test_a_data_set_becomes_a_corpus_in_its_own_space(name, tmp_path):
-    WRITERS[name](tmp_path)
-    dataset = open_dataset(tmp_path, "val" if name == "react" else "train")
-    corpus = gather(dataset, 60, MotionSpace(dataset.space, rest_of(dataset.space)))
-    assert corpus.frames.motion.shape == (sum(dataset.lengths), WIDTHS[dataset.space])
-    assert corpus.lengths == dataset.lengths and bool(corpus.frames.face_known.all())
 
 
 def test_a_corpus_leaves_out_what_cannot_be_used_and_says_so(tmp_path, caplog):

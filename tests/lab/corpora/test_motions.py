@@ -9,7 +9,6 @@ import pytest
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ
 from sfms_robot.lab.corpora.clips import SPLITS, read_takes
-from sfms_robot.lab.corpora.collection import columns
 from sfms_robot.lab.corpora.compose.motions import slow
 from sfms_robot.lab.corpora.compose.voices import facegood_mouth
 from sfms_robot.signals.motion_primitives import KINDS, read_motions
@@ -60,12 +59,3 @@ def test_rig_weights_become_arkit_channels_at_25_fps(tmp_path):
     moving = {name: mouth[0, index] for index, name in enumerate(BLENDSHAPES) if mouth[0, index]}
     assert len(mouth) == 50
     assert moving == pytest.approx({"jawOpen": 0.5, "mouthPucker": 0.4, "mouthSmileLeft": 0.3})
-
-
-@pytest.mark.parametrize("text, problem", [("a,b\n1\n", "not a table"), ("", "not a table"), (None, "not a table")])
-def test_a_table_that_cannot_be_read_is_named(tmp_path, text, problem):
-    file = tmp_path / "words.csv"
-    if text is not None:
-        file.write_text(text)
-    with pytest.raises(ConfigError, match=f"words.csv: {problem}"):
-        columns(file)

@@ -52,17 +52,6 @@ def test_interaction_tells_states_lips_and_borders_beside_what_a_rule_on_voices_
     assert sum(map(sum, table)) == 3 * (300 - 1), "every frame but the first of each dyad"
 
 
-@pytest.mark.slow
-def test_without_labels_to_learn_from_there_is_no_rule_to_stand_beside(command_line, listener, data, tmp_path):
-    shutil.copytree(data, tmp_path, dirs_exist_ok=True)
-    for place, scene in ((".", "listening"), ("speaking", "speaking"), ("interaction", "interaction")):
-        shutil.rmtree(tmp_path / place / "train")
-        clips.save(tmp_path / place / "train", [replace(dyad("a0", scene, 0), states=None)])
-    ended = command_line("evaluate", "interaction", "--listener", listener, "--data", tmp_path, "--json")
-    found = ended.told
-    assert ended.code == 0 and "state_accuracy" in found and "voice_rule_accuracy" not in found
-
-
 def test_interaction_is_for_listeners_that_speak(command_line, data):
     ended = command_line("evaluate", "interaction", "--listener", "sfms-small", "--data", data)
     assert ended.code == 2 and "sfms-small: does not speak; this command evaluates listeners of kind arig" in ended.err

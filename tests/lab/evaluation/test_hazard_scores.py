@@ -9,7 +9,7 @@ from sfms_robot.frames import EVENT_KINDS, FRAME_HZ, FRAME_S, FRAME_SAMPLES
 from sfms_robot.lab.corpora.compose.ami import read_people
 from sfms_robot.lab.evaluation import timing
 from sfms_robot.lab.evaluation.listener_meetings import SHIFT_S, ListenerMeeting, shifted
-from sfms_robot.lab.evaluation.meetings import annotated, delayed, sensed
+from sfms_robot.lab.evaluation.meetings import annotated, sensed
 from sfms_robot.lab.evaluation.rollout import speaker_frames
 from sfms_robot.lab.evaluation.whole_recordings import Scene, decisions, event_spans, hazards_in, heard_in, unspoken
 from sfms_robot.lab.learning.events.event_trainer import meeting_scene, muted, student
@@ -108,10 +108,6 @@ def test_what_is_decided_is_what_deciding_every_frame_decides(speaker, asked):
         ((decided, memory),) = when.decide_each([Sensed(index, row)], [memory])
         every += decided
     assert decisions(when, heard, [7], asked) == [tuple(every)] and "blink" in {event.kind for event in every}
-
-
-def test_delayed_hazards_know_a_frame_less():
-    assert delayed({"nod": np.array([1.0, 2.0, 3.0])})["nod"].tolist() == [1.0, 1.0, 2.0]
 
 
 # Deciles of the lengths [s] of phrases and of pauses in meetings: of oneself, and of the others.

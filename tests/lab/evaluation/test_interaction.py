@@ -120,31 +120,6 @@ def test_clips_without_a_speakers_face_do_not_count_for_rpcc():
     assert np.isnan(tables.scores(clips(), clips(2), np.full_like(other, np.nan), CENTRES)["RPCC exp"])
 
 
-def columns(rows):
-    """That all rows share; only of ours it is known who listens, for intervals over people."""
-    (shared,) = {tuple(key for key in row if key != "interval") for row in rows}
-    assert all(("interval" in row) == (row["source"] == "here") for row in rows)
-    return shared
-
-
-def test_rows_share_their_columns_and_hold_the_papers():
-    rows, _ = tables.rows_of("arig-2", clips(), clips(1), {"mine": clips(2)})
-    assert columns(rows)[:2] == ("name", "source")
-    assert rows[-1] == {"name": "ARIG", "source": "paper", "trainings": None, "FD exp": 18.39, "FD pose": 0.06,
-                        "RPCC exp": 0.05, "RPCC pose": 0.01, "SID exp": 4.82, "SID pose": 3.94,
-                        "Var exp": 2.91, "Var pose": 0.17}  # fmt: skip
-
-
-@pytest.mark.parametrize("table", ["arig-1", "arig-4"])
-def test_ablations_stand_beside_the_papers_in_its_order(table):
-    rows, _ = tables.rows_of(table, clips(), clips(1), {"ARIG": clips(2)})
-    by_name = {row["name"]: row for row in rows}
-    assert by_name["ARIG"]["paper RPCC"] == 0.125 and by_name["ARIG"]["source"] == "here"
-    printed = [name for name in tables.PRINTED[table]["rows"] if name not in ("GT", "ARIG")]
-    assert [*by_name] == ["GT", "ARIG", *printed] and set(tables.PRINTED[table]["ablations"]) <= {*printed}
-    assert "paper RPCC" in columns(rows)
-
-
 def verdicts(size: float, trainings: int = 3) -> dict[str, str]:
     """Return the verdicts of `claims` on ARIG with `size` times people's variance, beside a row with 0.75."""
     name, noise = "w/o continuous AR modeling", np.random.default_rng(0).normal(1, 0.01, 200)

@@ -13,7 +13,6 @@ from sfms_robot.lab.evaluation.intervals import (
     people_of,
     quotient,
     ratio,
-    verdict,
 )
 
 
@@ -88,20 +87,6 @@ def test_an_interval_of_clips_is_never_negative_and_widens_with_trainings_that_d
     people = [str(number) for number in range(20)]
     ours, theirs = (bootstrap(_mean_of(each), people)["mean"] for each in (values + 0.1, values))
     assert ours - theirs == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize(
-    ("interval", "comparable", "said"),
-    [
-        ((0.1, 0.4), True, "holds"),
-        ((-0.4, 0.0), True, "does not hold"),
-        ((-0.1, 0.4), True, "open"),
-        ((0.1, 0.4), False, "open"),
-        (None, True, "open"),
-    ],
-)
-def test_one_rule_says_what_holds(interval, comparable, said) -> None:
-    assert verdict(interval, comparable=comparable) == said
 
 
 def test_who_listens_is_told_by_seat_and_series_or_by_name() -> None:

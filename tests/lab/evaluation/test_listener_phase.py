@@ -76,12 +76,6 @@ def augmented(**changes):
     return seen, augment(seen, Grid([[5, 3], [2, 2]]), neutral, training, torch.Generator())
 
 
-def test_without_augmentation_nothing_changes():
-    seen, after = augmented()
-    for name in ("heard", "face_known", "tokens"):
-        assert torch.equal(getattr(seen, name), getattr(after, name))
-
-
 @pytest.mark.parametrize("changes, gone", [({"drop_audio": 1}, "heard"), ({"drop_face": 1}, "face_known")])
 def test_a_dropped_modality_is_gone_and_the_other_stays(changes, gone):
     seen, after = augmented(**changes)

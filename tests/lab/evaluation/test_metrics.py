@@ -24,16 +24,6 @@ def test_frechet_equals_the_matrix_root_and_paired_sees_what_it_cannot():
     assert metrics.paired_frechet_distance(target, other, speaker) > 1.0
 
 
-def test_variances_and_l2_are_their_definitions():
-    x = RNG.normal(size=(5, 30, 4)) * [1, 2, 3, 4] + [0, 10, 20, 30]
-    assert metrics.variance(x) == pytest.approx(np.var(x))
-    assert metrics.variance(x, "time") == pytest.approx(np.mean([np.var(c, axis=0).mean() for c in x]))
-    assert metrics.variance(x, "sum") == pytest.approx(sum(np.var(x[..., d]) for d in range(4)))
-    a, b = RNG.normal(size=(2, 40, 3)), RNG.normal(size=(2, 40, 3))
-    assert metrics.l2(a, b) == pytest.approx(np.mean([np.linalg.norm(x) for x in (a - b).reshape(-1, 3)]))
-    assert metrics.mse(a, b) == pytest.approx(((a - b) ** 2).mean())
-
-
 def test_shannon_index_is_log_k_of_even_use_and_counts_nearest_centres():
     centres = np.arange(8.0)[:, None] * 10
     even = np.repeat(centres, 50, axis=0)[None]

@@ -32,14 +32,6 @@ def test_the_same_motion_cannot_be_told_apart_and_another_pace_can():
 
 
 @pytest.mark.slow
-def test_a_region_in_which_nothing_moves_tells_nothing():
-    rng = np.random.default_rng(3)
-    slow, fast = ([sway(rng, hz) for _ in range(DYADS)] for hz in (0.6, 2.0))
-    auc, _, _ = separability(cut(fast), cut(slow, 1), "brows")  # it is the noise of both
-    assert 0.3 < auc < 0.7
-
-
-@pytest.mark.slow
 def test_rounding_and_what_no_tracker_sees_is_not_judged():
     """Steps of a hundredth of a degree and a buzz of 10 Hz are gone behind the low-pass and the noise."""
     rng = np.random.default_rng(5)

@@ -182,14 +182,3 @@ def test_strengths_are_found_again():
             won = rng.binomial(4000, 1 / (1 + np.exp(true[other] - true[one])))
             wins[one, other], wins[other, one] = won, 4000 - won
     np.testing.assert_allclose(bradley_terry(wins), true, atol=0.08)
-
-
-@pytest.mark.slow
-def test_who_always_wins_has_a_finite_strength_and_intervals_need_people():
-    given = answers({"a": 6}, people=3) + answers({"b": 6}, left="b", right="c", people=3)
-    strengths = summary(given)["bradley_terry"]["person"]
-    assert strengths["a"]["strength"] > strengths["b"]["strength"] > strengths["c"]["strength"]
-    low, high = strengths["a"]["interval"]
-    assert low <= strengths["a"]["strength"] <= high and np.isfinite([low, high]).all()
-    alone = summary(answers({"a": 6}) + answers({"b": 6}, left="b", right="c"))["bradley_terry"]["person"]
-    assert alone["a"]["interval"] is None and set(QUESTIONS) >= {"person", "attentive", "natural", "in_time"}

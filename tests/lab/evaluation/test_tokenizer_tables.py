@@ -16,13 +16,10 @@ from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.lab.corpora.clips import read_takes
 from sfms_robot.lab.evaluation import tokenizer_tables
 from sfms_robot.lab.evaluation.table_tokenizers import (
-    COMPARED,
     TableModel,
     keyframe_bits,
     load_tokenizer,
-    recipe_of,
     save_tokenizer,
-    seeded,
 )
 from sfms_robot.lab.evaluation.table_training import load_history, train
 from sfms_robot.lab.evaluation.tokenizer_tables import Windows, cluster, integrity, restoration_errors
@@ -33,7 +30,6 @@ from sfms_robot.listeners import checkpoint
 from sfms_robot.listeners.sfms.placement import place_exact
 from sfms_robot.signals.tracks import Take
 
-RECIPES = {name: recipe_of(name, steps=3) for name in COMPARED["recipes"]}
 TRAINING = {"steps": 3, "batch": 2, "learning_rate": 1e-3, "evaluate_every": 0, "score_tracks": 4}
 
 
@@ -140,20 +136,6 @@ def test_scores_are_in_deviations_of_the_training_motion_and_count_every_channel
     errors, angle_rmse_rad, shape_rmse = restoration_errors(TableModel(dense()), torch.zeros_like(wrong), wrong)
     assert errors == pytest.approx([1 / 58, 4 / 58])
     assert angle_rmse_rad == pytest.approx(np.sqrt(0.5 / 3)) and shape_rmse == pytest.approx(np.sqrt(2 / 52))
-
-
-def test_names_say_seed_steps_and_learning_rate_and_every_table_needs_only_recipes() -> None:
-    for name in tokenizer_tables.TABLES:
-        assert set(tokenizer_tables.needed(name)) <= set(RECIPES)
-    every = {name for table in tokenizer_tables.TABLES for name in tokenizer_tables.needed(table)}
-    assert every == set(RECIPES), "none is trained in vain"
-    assert {*COMPARED["shipped"]} == {folder.name for folder in (data_dir("configs") / "tokenizers").iterdir()}
-    assert [recipe_of(name).seed for name in seeded("sparse-all-k3", 3)] == [1, 2, 3]
-    written = "sparse-all-k7-as-written"
-    assert recipe_of(f"{written}-8000-seed2").training.steps == 8000
-    assert recipe_of(f"{written}-8000", steps=2).training.steps == 2
-    assert recipe_of(f"{written}-slower-scores").training.score_learning_rate == 3e-4
-    assert recipe_of(f"{written}-tempered").training.tempered_draws
 
 
 def test_a_dense_window_pays_for_every_frame_and_a_grouped_one_for_every_eight() -> None:

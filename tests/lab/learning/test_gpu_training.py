@@ -11,17 +11,14 @@ from test_training_loop import same, toy, weights
 from tiny_arig_training import settings, write
 from tiny_sfms_training import configuration
 
-from sfms_robot.config import parse_training
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.lab.learning.arig.features import fit_scales, gather, open_scenes
 from sfms_robot.lab.learning.arig.trainer import Student, augment, decayed, loss_parts, state_loss, train_arig
 from sfms_robot.lab.learning.corpus import Corpus
 from sfms_robot.lab.learning.job import OwnNoise, Run, noise_of
-from sfms_robot.lab.learning.sfms.features import place_all
 from sfms_robot.lab.learning.train_runs import TrainOptions, pack_data, train_listener
 from sfms_robot.lab.learning.training_loop import READ_EVERY, checkpoint_file, fit, peek
 from sfms_robot.listeners.arig.model import ArigModel
-from sfms_robot.listeners.sfms.model import SfmsModel
 from sfms_robot.listeners.space import MotionSpace
 
 TOLD = {"events": True, "draws": "innovation", "sway": True}
@@ -118,15 +115,6 @@ def test_a_gpu_without_memory_keeps_the_steps_made_so_far(tmp_path, every):
     )
     assert peek(checkpoint_file(tmp_path, "toy"))[0].step == 7
     assert fit(toy(evaluate_every=0), tmp_path, Run(resume=True)).steps == 12
-
-
-def test_dyads_are_placed_together_as_they_are_alone():
-    torch.manual_seed(0)
-    tokenizer = SfmsModel(parse_training(configuration(), "tiny").listener).tokenizer
-    lengths = [48 * 3, 48 * 2 + 20, 60]
-    motion = torch.randn(sum(lengths), 58)
-    alone = [place_all(tokenizer, dyad, [len(dyad)]) for dyad in motion.split(lengths)]
-    assert torch.equal(place_all(tokenizer, motion, lengths), torch.cat(alone))
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from sfms_robot.lab.evaluation.metrics import dtw
 from sfms_robot.lab.learning.sfms.predictor_trainer import keyframe_dtw, next_tokens, soft_dtw
-from sfms_robot.lab.learning.sfms.tokenizer_trainer import masking, reconstruction
+from sfms_robot.lab.learning.sfms.tokenizer_trainer import reconstruction
 
 MEMBER = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
 
@@ -28,11 +28,6 @@ def test_the_quantization_term_counts_keyframes_of_their_own_group_only():
     assert reconstruction(motion, motion, wrong, mask, MEMBER, 0.0) == 0
     mask[0, 1, 0] = 1.0
     assert reconstruction(motion, motion, wrong, mask, MEMBER, 0.0) == pytest.approx(9 / 3)
-
-
-def test_masking_is_the_distance_to_the_best_mask():
-    best = torch.tensor([1.0, 0.0, 1.0])[None, :, None]
-    assert masking(best, best) == 0 and masking(1 - best, best) == 3
 
 
 def test_next_token_loss_is_weighted_cross_entropy_of_the_counted_frames():
@@ -66,8 +61,3 @@ def test_a_keyframe_one_frame_late_costs_less_than_none_and_more_than_in_time():
     in_time, late, none = (float(keyframe_dtw(one, indicator(3), 0.01)) for one in
                            (indicator(3), indicator(4), indicator()))  # fmt: skip
     assert in_time <= late < none
-
-
-def test_a_gamma_that_is_not_above_0_is_refused():
-    with pytest.raises(ValueError, match="gamma 0 must be above 0"):
-        soft_dtw(torch.zeros(1, 2, 2), 0.0)

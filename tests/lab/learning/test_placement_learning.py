@@ -48,14 +48,6 @@ def test_states_are_those_of_one_choice_each():
         assert coming == k[row] - count
 
 
-def test_imitation_is_the_same_for_the_same_generator_and_reaches_every_weight():
-    score, track = score_network(), tracks(bumps(4), ONE, 1)
-    losses = [imitation(score, track, 4, torch.Generator().manual_seed(2)) for _ in range(2)]
-    assert losses[0] == losses[1]
-    losses[0].backward()
-    assert all(p.grad is not None and p.grad.isfinite().all() for p in score.parameters())
-
-
 def test_lively_tracks_are_drawn_before_still_ones():
     motion = torch.zeros(8, 24, 2)
     motion[..., 1] = torch.randn(8, 24) * 3

@@ -86,14 +86,6 @@ def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placemen
     assert people["blinks"] >= 0 and own["jerk_deg_s3"] > 0
 
 
-@pytest.mark.slow
-def test_more_training_reconstructs_better(data, tmp_path):
-    few = settings(tokenizer={"steps": 1, "batch": 8, "learning_rate": 5e-3})
-    many = settings(tokenizer={"steps": 120, "batch": 8, "learning_rate": 5e-3})
-    before = tokenizer.train_tokenizer(few, data, tmp_path)["mse"]
-    assert tokenizer.train_tokenizer(many, data, tmp_path)["mse"] < 0.7 * before
-
-
 def trained(phase: str, chosen: config.Training, data, out, run=Run()):  # noqa: B008
     return (tokenizer.train_tokenizer if phase == "tokenizer" else listener.train_listener)(chosen, data, out, run)
 
