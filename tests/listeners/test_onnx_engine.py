@@ -15,11 +15,9 @@ from sfms_robot.config.listener import parse_listener
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ModelError
 from sfms_robot.frames import SpeakerFrame
-from sfms_robot.listeners.arig.networks import large_layers
 from sfms_robot.listeners.checkpoint import WEIGHTS, load_config, save_config
 from sfms_robot.listeners.engine import HALF, OnnxEngine, digest, integers, read_graphs
 from sfms_robot.listeners.registry import engine_name, load_listener
-from sfms_robot.listeners.torch_engine import new_model
 
 LISTENERS = data_dir("configs") / "listeners"
 SHIPPED = ["sfms-small", "arig-small"]
@@ -136,19 +134,6 @@ def test_graphs_hang_on_what_they_hold_and_on_nothing_else():
     settings = load_config(LISTENERS / "sfms-small")
     other = settings.model_copy(update={"description": "another", "hop": 2})
     assert digest(settings) == digest(other) != digest(settings.model_copy(update={"ramp_frames": 3}))
-
-
-def test_large_layers_are_in_integers_and_the_blocks_of_the_sampler_too():
-    small = {"kind": "arig", "heads": 4, "context_chunks": 8, "diffusion": {"steps": 4, "train_steps": 50, "blocks": 1}}
-    names = {
-        width: large_layers(new_model(parse_listener(small | {"width": width, "feedforward": 2 * width}, "test")))
-        for width in (16, 256)
-    }
-    assert not [name for name in names[16] if not name.startswith("head.")]
-    assert {name.split(".")[0] for name in names[256]} >= {"short", "long", "progress", "head"}
-    assert {name for name in names[256] if name.startswith("head.")} <= {
-        "head.modulation.linear.weight", "head.up.0.weight", "head.down.0.weight"
-    }  # fmt: skip
 
 
 def test_integers_without_graphs_of_them_are_refused(tmp_path):

@@ -4,7 +4,7 @@ import json
 import logging
 
 import pytest
-from remote_rig import SERVER_CLOCK_S, Counting, Network, Robot, Server, frames
+from remote_rig import Counting, Network, Robot, Server, frames
 
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ConfigError
@@ -35,7 +35,7 @@ def test_plans_come_as_from_a_listener_of_ones_own():
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize(("horizon", "hop"), [(8, 2), (8, 3)])
+@pytest.mark.parametrize(("horizon", "hop"), [(8, 2), (8, 3), (1, 1)])
 def test_50_ms_20_ms_of_jitter_and_2_percent_of_loss_leave_no_gap_over_120_ms(horizon, hop, seed):
     head = robot(Network(0.05, 0.02, 0.02, seed), horizon=horizon, hop=hop).run(30.0)
     settled = [gap for at_s, gap in head.gaps_s if at_s > 2.0]
@@ -81,12 +81,6 @@ def test_a_server_that_was_started_anew_is_joined_again(caplog):
         head.run(2.0)
     assert not head.feed.lost and figures(head)["restarts"] == 1
     assert "was started again" in caplog.text
-
-
-def test_the_clock_of_the_server_is_known_within_what_it_says():
-    link = figures(robot(Network(0.05, 0.02)).run(20.0))["link"]
-    assert abs(link["clock_offset_s"] - SERVER_CLOCK_S) <= link["clock_offset_within_ms"] * 1e-3 + 1e-3
-    assert 60 < link["round_trip_ms"]["p50"] < 150
 
 
 def test_an_event_is_told_once_though_it_is_sent_with_three_plans_and_some_are_lost():

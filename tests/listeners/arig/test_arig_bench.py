@@ -1,18 +1,10 @@
 """The parts of `sfms-robot bench listener` that judge rather than time."""
 
 import pytest
-from tiny_arig import arig_listener, talk
+from tiny_arig import arig_listener
 
-from sfms_robot.lab.bench import listener_bench as bench
 from sfms_robot.lab.bench.listener_bench import in_run
 from sfms_robot.listeners import checkpoint
-
-
-@pytest.mark.parametrize("minutes", [1, 60])
-def test_a_memory_minutes_old_goes_on(minutes: int):
-    listener = arig_listener()
-    memory = bench.aged(listener, listener.start(0), talk(5), minutes)
-    assert memory.frames == minutes * 1500 and memory.context.any()
 
 
 @pytest.mark.slow

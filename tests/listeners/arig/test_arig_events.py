@@ -50,19 +50,6 @@ def test_later_control_never_changes_earlier_plans(told, changed_from: int):
     assert not np.array_equal(before[changed_from:], after[changed_from:])
 
 
-@pytest.mark.parametrize("shape", [(2, 5), (1, len(COLUMNS)), (3, len(COLUMNS)), (len(COLUMNS),)])
-def test_control_of_another_shape_is_refused(told, shape):
-    with pytest.raises(ValueError, match="control has shape"):
-        told.step(talk(1)[0], told.start(1), np.zeros(shape, np.float32))
-
-
-def test_a_listener_without_events_takes_no_control():
-    deaf = arig_listener()
-    assert deaf.control_frames == (0, 0) and arig_listener(**TOLD).control_frames == (1, 1)
-    with pytest.raises(ValueError, match=r"control has shape \(2, 36\), not \(0, 0\)"):
-        deaf.step(talk(1)[0], deaf.start(1), nods(2))
-
-
 @pytest.mark.parametrize("draws", ["motion", "step", "innovation"])
 def test_eyes_rest_whatever_the_weights_say(draws: str):
     out = streamed(soft(arig_listener(events=True, draws=draws)), talk(8), 1, nods(9, 0.1))
@@ -127,13 +114,13 @@ def test_what_was_drawn_wrongly_is_forgotten_at_the_rate_of_the_data(rho, place,
     assert torch.allclose(model.moved(one, torch.full([58], place)), torch.full([58], drawn), rtol=1e-3, atol=1e-3)
 
 
-def test_an_hour_of_independent_draws_stays_where_the_data_are():
+def test_independent_draws_stay_where_the_data_are():
     """Innovations as large as those of a process of deviation 1 make places of deviation 1, however long it runs."""
     model = arig_model(draws="innovation")
-    model.rho.fill_(0.99)
-    model.step_std.fill_(((1 - 0.99**2) / ((np.e**2 - 1) / 2)) ** 0.5)  # the power of sinh of normal numbers
+    model.rho.fill_(0.9)
+    model.step_std.fill_(((1 - 0.9**2) / ((np.e**2 - 1) / 2)) ** 0.5)  # the power of sinh of normal numbers
     generator, place, places = torch.Generator().manual_seed(0), torch.zeros(58), []
-    for _ in range(90_000):
+    for _ in range(9_000):
         place = model.drawn(torch.randn(58, generator=generator), place)
         places.append(place)
     for part in torch.stack(places).chunk(4):

@@ -95,12 +95,6 @@ def test_memory_takes_the_same_room_at_every_step(tiny):
     assert room[0] > 0 and set(room.values()) == {room[0]}
 
 
-@pytest.mark.parametrize("space", ["faceverse58", "deca56"])
-def test_every_motion_space_is_streamed(space: str):
-    out = streamed(arig_listener(motion_space=space), talk(8))
-    assert out.shape == (8, 58) and np.isfinite(out).all()
-
-
 def test_sound_that_is_not_finite_is_silence(tiny):
     speaker = talk(10)
     broken = [dataclasses.replace(f, audio=f.audio * np.nan, agent_audio=f.agent_audio * np.inf) for f in speaker]

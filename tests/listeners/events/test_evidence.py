@@ -137,8 +137,3 @@ def test_done_one_by_one_equals_done_in_whole(seed):
             rows[times] = np.where(rows[times] > evidence.REMEMBERED_S - 2.1, np.inf, rows[times])
         np.testing.assert_allclose(row, expected, atol=1e-9)
         np.testing.assert_allclose(kept, expected, atol=1e-9)
-
-
-def test_every_column_is_named_once():
-    assert evidence.EVIDENCE == evidence.HEARD + evidence.DONE and len(set(evidence.EVIDENCE)) == len(evidence.EVIDENCE)
-    assert heard_in(scene(0)).shape == (FRAMES, len(evidence.HEARD))

@@ -190,29 +190,6 @@ def test_scores_do_not_depend_on_size_or_offset_of_the_motion(scale: float, seed
     torch.testing.assert_close(plain, moved, rtol=1e-2, atol=1e-2)
 
 
-@pytest.mark.parametrize(
-    "strategy, wrong", [("learned", "learned_paper"), ("learned", None), ("learned_paper", "learned")]
-)
-def test_a_learned_placement_without_its_own_scores_is_refused(strategy, wrong):
-    with pytest.raises(ValueError, match="score network"):
-        place(torch.zeros(1, 9, 3), [2, 2], strategy, member=MEMBER, score=scores(wrong) if wrong else None)
-
-
-def test_curves_of_few_channels_hold_all_of_their_motion_and_scores_know_what_is_to_come():
-    motion = torch.randn(4, 20, 3)
-    found = tracks(motion, torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), 2)
-    centred = motion - motion.mean(1, keepdim=True)
-    for group, channels in enumerate(([0, 1], [2])):
-        own = centred[..., channels]
-        own = own / own.square().sum(-1).mean(1).sqrt()[:, None, None]
-        curves = found.curves.view(4, 2, 20, 2)[:, group]
-        torch.testing.assert_close(curves @ curves.transpose(1, 2), own @ own.transpose(1, 2), rtol=1e-4, atol=1e-4)
-    score = ConditionalScore(1, 8, 2, 1)
-    track = tracks(torch.randn(1, 12, 1).cumsum(1), torch.ones(1, 1), 1)
-    told = [score(track, torch.zeros(1, 12), torch.tensor([k])) for k in (0, 1, 5)]
-    assert not torch.allclose(told[0], told[1]) and not torch.allclose(told[1], told[2])
-
-
 # --- As many as pay for themselves ---
 COST = st.floats(0.02, 20)
 
