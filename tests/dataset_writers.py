@@ -74,8 +74,8 @@ def lm_listener(root: Path, subject: str = "trevor", lengths: tuple[int, ...] = 
     return root
 
 
-def react(root: Path, pairs: int = 2, split: str = "val", frames: int = 751, pose_first: bool = False) -> Path:
-    """NoXI clips of 30 s: an expert and a novice each; the Emotion tree with the names of the cleaned release."""
+def react(root: Path, pairs: int = 2, split: str = "val", frames: int = 101, pose_first: bool = False) -> Path:
+    """An expert and a novice each (published: 751 frames); the Emotion tree with the names of the cleaned release."""
     rows = []
     for number in range(pairs):
         people = [f"NoXI/00{number}_Paris/{person}/1" for person in ("Expert_video", "Novice_video")]

@@ -140,7 +140,7 @@ def test_lm_listener_joined_folder_gives_way_to_its_parts(tmp_path):
 
 
 def test_react_pairs_are_mirrored_in_the_order_of_the_matrix(tmp_path):
-    dataset = open_dataset(write.react(tmp_path), "validation")
+    dataset = open_dataset(write.react(tmp_path, frames=751), "validation")
     people = [name.split("+")[2] for name in dataset.names]
     assert people == ["Novice_video"] * 2 + ["Expert_video"] * 2
     assert [clip.row for clip in dataset.clips] == [0, 1, 2, 3] and dataset.lengths == (750,) * 4
@@ -157,7 +157,7 @@ def test_react_row_survives_clips_that_are_left_out(tmp_path):
 
 def test_react_attributes_are_those_of_the_listener_under_either_name(tmp_path):
     dataset = open_dataset(write.react(tmp_path), "val", features=["attributes", "speaker_attributes"])
-    novice = react.attributes(tmp_path / "val", "NoXI/000_Paris/P2/1", 750)
+    novice = react.attributes(tmp_path / "val", "NoXI/000_Paris/P2/1", 101)
     np.testing.assert_array_equal(dataset[0].features["attributes"], novice)
     np.testing.assert_array_equal(dataset[2].features["speaker_attributes"], novice)
 
