@@ -5,7 +5,7 @@
 
 Sections: `options` (names, types and defaults of every command), `keys` (of the object that a command prints with
 --json), `wire` (bytes that the contract rigs send), `figures` (`head solve`, `evaluate metrics`).
-tests/pins/test_pins.py holds the project to them.
+tests/pins/test_pins.py holds the project to them, test_base_install.py to the keys.
 
 Floats differ between machines in their last digits: figures have a tolerance, and motion, which a listener feeds back
 into itself, is compared between two checkouts on one machine.

@@ -21,13 +21,6 @@ def test_a_command_that_fails_prints_the_same_keys(command_line, words):
     assert (ended.code, set(ended.told)) == (2, FAILED)
 
 
-@pytest.mark.slow
-def test_commands_print_the_keys_that_they_printed(command_line):
-    now = pins.keys(lambda words: command_line(*words.split(), "--json").told)
-    for words, before in pins.golden("keys").items():
-        assert set(before) <= set(now[words]), words
-
-
 def test_contract_rigs_send_the_same_bytes():
     assert pins.wire() == pins.golden("wire")
 
