@@ -28,6 +28,7 @@ from sfms_robot.listeners.idle import (
     IdleMotion,
     RestMap,
     draw_sway,
+    head_channels,
     sway_at,
 )
 from sfms_robot.listeners.space import MotionSpace
@@ -91,8 +92,9 @@ def test_the_heads_of_shipped_listeners_sway_as_far_as_people_do(name: str):
     low, high = np.array(PEOPLE_RAD).T
     outside, alive = [], []
     for seed in range(60):
-        still = np.tile(space.neutral.astype(np.float32), (15_000, 1))
-        pose = space.decode(sway.added(still, sway.start(seed), 0)[100::10])[0][:, :3]
+        motion = np.tile(space.neutral.astype(np.float32), (1490, 1))
+        motion[:, head_channels(settings.channels)] += sway_at(sway.start(seed), 4.04 + 0.4 * np.arange(1490))
+        pose = space.decode(motion)[0][:, :3]
         outside.append(((pose < low) | (pose > high)).mean(0))
         alive.append(pose.std(0))
     assert np.mean(outside, axis=0).max() < 0.05

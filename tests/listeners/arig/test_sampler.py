@@ -57,16 +57,6 @@ def test_the_levels_of_noise_are_dense_where_motion_is_small_if_asked():
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("changes", [{"sampler": "ddim"}, {"temperature": 0.0}])
-def test_without_added_noise_the_start_decides(changes):
-    model = denoiser(**changes)
-    z, noise = torch.randn(2, 8), torch.randn(2, 5, 3)
-    other = torch.cat([noise[:, :1], torch.randn(2, 4, 3)], dim=1)
-    torch.testing.assert_close(model.sample(z, noise), model.sample(z, other))
-    assert not torch.allclose(model.sample(z, noise), model.sample(z, noise + 1))
-
-
-@torch.no_grad()
 def test_a_temperature_of_some_channels_scales_the_noise_that_is_added_to_them():
     model = denoiser(temperature=0.3, temperatures={"eye": 2.0, "jaw": (1.4, 0.2)})
     z, noise = torch.randn(2, 8), torch.randn(2, 5, 3)
