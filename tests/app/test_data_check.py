@@ -77,14 +77,6 @@ def test_figures_are_those_of_the_files(tmp_path):
     assert split["features"] == {"attributes": 2, "speaker_attributes": 2, "wav2vec2": 2}
 
 
-def test_features_that_nobody_ships_are_a_count_of_none(tmp_path):
-    write.react(tmp_path, frames=60)
-    for file in (tmp_path / "val" / "Emotion").rglob("*.csv"):
-        file.unlink()
-    found, split = problems(check_data(tmp_path), "validation")
-    assert not found and split["features"] == {"attributes": 0, "speaker_attributes": 0}
-
-
 def test_swapped_order_makes_a_set_unusable_until_it_is_said(tmp_path, command_line):
     write.l2l(tmp_path, pose_first=True)
     ended = command_line("data", "check", tmp_path, "--json")

@@ -38,22 +38,6 @@ def test_bytes_are_those_of_the_packets(servos, read, write):
     assert budget["fast"]["bytes"] == len(goals) + len(ask) + fast
 
 
-@pytest.mark.parametrize(
-    ("servos", "wire", "ms"),
-    [
-        (9, FACTORY, 58.2),
-        (25, FACTORY, 124.5),
-        (9, {**FACTORY, "baud": 1_000_000}, 22.7),
-        (25, {**FACTORY, "baud": 1_000_000}, 34.0),
-        (9, TUNED, 3.2),
-        (25, TUNED, 6.5),
-    ],
-)
-def test_figures_of_a_sync_read_and_a_sync_write_of_four_bytes(servos, wire, ms):
-    budget = diagnosis.wire_budget("dynamixel2", servos, **wire, read_bytes=4)
-    assert budget["plain"]["ms"] == pytest.approx(ms, abs=0.06) and budget["fast"]["hz"] > budget["plain"]["hz"]
-
-
 def test_single_reads_pay_the_adapter_once_per_servo_and_fast_sync_read_makes_a_bus_fast_enough():
     slow = diagnosis.wire_budget("dynamixel1", 9, 1_000_000, 500.0, 16.0, read_bytes=2, write_bytes=2)
     assert slow["plain"]["ms"] == pytest.approx(150, abs=0.5) and slow["fast"] is None

@@ -279,15 +279,6 @@ def no_port(path: str) -> dict:
     return examine_line(line, partial(SerialPort, path, BAUD, RealClock()))
 
 
-def test_a_port_that_is_none_and_unknown_families_and_heads_end_it_at_once(tmp_path):
-    assert no_port(str(tmp_path))["exit_code"] == 3 and "directory" in no_port(str(tmp_path))["findings"][0]["problem"]
-    assert no_port(str(tmp_path / "x"))["exit_code"] == 3
-    with pytest.raises(ConfigError, match="dynamixel2"):
-        examine("/dev/null", None, "dynamixel9", None)
-    with pytest.raises(ConfigError, match="nobody"):
-        examine("sim", "nobody", None, None)
-
-
 def test_a_port_that_somebody_holds_ends_in_three():
     with patient() as sick:
         with closing(SerialPort(sick.chain.device, BAUD, sick.clock)):
@@ -368,10 +359,3 @@ def test_what_a_heads_file_says_is_not_said_once_more(where, flag, value):
     said = {"family": None, "baud": None, flag.removeprefix("--"): value}
     with pytest.raises(ConfigError, match=f"^{flag} {value}: head '{where['head'] or 'face28'}'"):
         examine(**where, **said)
-
-
-@pytest.mark.parametrize("url", ["socket://nohost", "ftp://host:1"])
-def test_an_address_that_is_none_gets_no_advice_about_files(url):
-    report = examine(url, None, None, None)
-    (finding,) = report["findings"]
-    assert report["exit_code"] == 3 and "://HOST:PORT" in finding["problem"] and "fuser" not in finding["fix"]

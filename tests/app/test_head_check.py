@@ -79,16 +79,6 @@ def test_a_folder_without_tracks_is_refused_and_a_home_out_of_reach_is_a_problem
     assert "home is out of reach" in " ".join(check(str(tmp_path))["problems"])
 
 
-def test_the_list_has_every_head_with_its_families(command):
-    code, out = command("list", "--json")
-    heads = {head["name"]: head for head in json.loads(out)["heads"]}
-    assert code == 0 and set(FACES) < set(heads) and list(heads) == [head["name"] for head in shipped_heads()]
-    assert heads["open_duck_mini_v2_head"]["buses"] == {"neck": "feetech", "antennas": "maestro"}
-    families = {family for head in heads.values() for family in head["buses"].values()}
-    assert families == {"dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32"}
-    assert "stewart" in next(line for line in command("list")[1].splitlines() if "reachy_mini" in line)
-
-
 def test_show_tells_value_and_origin(command):
     code, out = command("show", "face28", "--joint", "eye_pan_right", "--json")
     assert code == 0
@@ -104,15 +94,6 @@ def test_a_shipped_head_has_its_picture_and_provenance(head):
     text = (folder / "README.md").read_text()
     assert "## Provenance" in text and "## What this head cannot show" in text
     assert all(joint in text for joint in load_head(head).joints)
-
-
-def test_an_overlay_of_another_head_is_told(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    overlay = tmp_path / "sfms-robot" / "heads" / "op3_head.yaml"
-    overlay.parent.mkdir(parents=True)
-    overlay.write_text("head: poppy_head\n")
-    (problem,) = check("op3_head")["problems"]
-    assert problem == f"{overlay}: head = 'poppy_head' is another head (op3_head)"
 
 
 OWL = """\

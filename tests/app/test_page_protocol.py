@@ -5,7 +5,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 import sfms_robot
 from sfms_robot.app.listen.knobs import turned
@@ -14,7 +13,6 @@ from sfms_robot.app.options import RunOptions
 from sfms_robot.config import load_head
 from sfms_robot.frames import MOTION_DIM
 from sfms_robot.viewer import page_messages
-from sfms_robot.viewer.page_server import COMMAND_S, MOST_MALFORMED, OUTBOX, PERSON_S
 
 DOCS = Path(sfms_robot.__file__).parents[1] / "docs"
 PAGE = (DOCS / "reference" / "protocol.md").read_text(encoding="utf-8").partition("## The page's WebSocket\n")[2]
@@ -52,17 +50,3 @@ def test_every_message_and_every_key_of_a_hello_and_of_a_frame_is_described():
         0.0, np.zeros(MOTION_DIM), np.zeros(1), np.zeros(1, np.float32), page_messages.rare_json("idle", (), {}, None)
     )
     assert set(json.loads(page_messages.frame_json(record))) - {"type"} <= rows(TOLD)["frame"]
-
-
-@pytest.mark.parametrize(
-    "said",
-    [
-        f"version {page_messages.VERSION},",
-        f"{page_messages.LONGEST_COMMAND} characters",
-        f"{page_messages.LONGEST_PERSON} bytes",
-        f"{1 / COMMAND_S:g} a second, sound and faces at {1 / PERSON_S:g}",
-        f"{OUTBOX} messages unread",
-    ],
-)
-def test_limits_are_those_of_the_code(said):
-    assert said in PAGE and MOST_MALFORMED == 100  # "the hundred and first"

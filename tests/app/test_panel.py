@@ -69,10 +69,3 @@ def test_no_line_is_wider_than_the_terminal(width, level, why, time_s):
     document = status("degraded", tuple(why), faults=JOINTS)
     document["person"] |= {"voice_db": level, "own_voice_db": level}
     assert max(map(len, drawn(document | {"time_s": time_s}, width).splitlines())) <= width
-
-
-def test_intensity_is_one_number_where_all_regions_are_turned_alike_and_nothing_where_none_is():
-    assert "intensity" not in drawn(status() | {"intensity": {"neck": 1.0, "eyes": 1.0}})
-    assert "intensity 1.2" in " ".join(drawn(status() | {"intensity": {"neck": 1.2, "eyes": 1.2}}).split())
-    told = drawn(status() | {"intensity": {"neck": 0.5, "eyes": 1.0, "lids": 1.1}})
-    assert "neck 0.5, lids 1.1" in told and "eyes" not in told

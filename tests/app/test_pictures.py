@@ -64,12 +64,6 @@ def test_a_sheet_shows_what_happened():
     assert max(np.diff(times_s[list(instants)])) < 4.0
 
 
-@pytest.mark.parametrize("frames", [1, 5, 12])
-def test_a_short_run_gives_every_frame_once(frames):
-    instants = pick_instants(np.arange(frames) / 25, np.zeros((frames, 58), dtype=np.float32))
-    assert list(instants) == list(range(frames))
-
-
 @pytest.mark.parametrize("head", ["op3_head", "gone"])
 def test_pictures_are_drawn_without_a_display_and_without_the_head(tmp_path, head):
     pytest.importorskip("vtkmodules")

@@ -31,36 +31,12 @@ def test_without_a_terminal_a_line_every_ten_seconds_estimates_the_rest(capsys):
     assert len(lines.splitlines()) == 100 / PLAIN_EVERY_S - 1  # none when it has ended: the result follows
 
 
-def test_lines_estimate_the_rest_from_the_checkpoint_or_say_how_long_it_took_so_far(capsys):
-    now_s = [0.0]
-    moved = PlainBar("tokenizer", lambda: now_s[0])
-    moved(900, 1000, "loss 0.5")
-    now_s[0] = 20.0
-    moved(910, 1000, "loss 0.4")
-    assert capsys.readouterr().err == "tokenizer: 91%, loss 0.4, about 3 min left\n"
-    now_s = [0.0]
-    moved = PlainBar("composing dyads", lambda: now_s[0])
-    now_s[0] = 30.0
-    moved(0, 0, "reading")
-    assert capsys.readouterr().err == "composing dyads: reading, 30 s so far\n"
-
-
 def test_short_work_is_silent_and_a_hidden_bar_shows_nothing(capsys):
     assert list(tracked([1, 2, 3], "counting")) == [1, 2, 3]
     assert capsys.readouterr() == ("", "")
     with bar("looking", hidden=True) as moved:
         moved(1, 2, "id 1")
     assert capsys.readouterr() == ("", "")
-
-
-@pytest.mark.usefixtures("terminal")
-def test_on_a_terminal_a_bar_shows_share_time_and_rest_on_stderr_alone(capsys):
-    with bar("exporting [x] {y}") as moved:
-        moved(0, 4, "graph heads")
-        moved(1, 4, "graph told")
-    out, text = capsys.readouterr()
-    assert not out
-    assert "exporting [x] {y}" in text and "25 %" in text and "graph told" in text and "left" in text
 
 
 @pytest.mark.usefixtures("terminal")

@@ -73,13 +73,6 @@ def test_a_fixed_rate_is_the_only_one_looked_at():
             wire.find(2)
 
 
-def test_ids_are_parsed_or_explained():
-    assert single.checked_ids("1,5,10-12") == [1, 5, 10, 11, 12]
-    for text in ("", "a", "3-1", "1,,2", "-4"):
-        with pytest.raises(ConfigError, match="list of ids"):
-            single.checked_ids(text)
-
-
 def test_a_model_without_a_number_is_read_when_somebody_says_what_it_is():
     with wire_on(EmulatedServo(1, "sts3032"), family="feetech") as (wire, _):
         with pytest.raises(ConfigError, match=r"no firmware map.*sts3032.*--model"):
@@ -268,16 +261,6 @@ def test_a_factory_reset_takes_no_other_servos_id():
 
 
 # --- watching ---------------------------------------------------------------------------------------------------
-def test_watching_shows_position_supply_and_who_fell_silent(three):
-    wire, chain = three
-    servos = [wire.find(1), wire.find(7)]
-    chain.kill(7)
-    before = chain.digest()
-    one, seven = (single.watched(seen) for seen in servos)
-    assert one["position"] == 2048 and one["position_deg"] == 180.0 and one["torque"] is False
-    assert 3.0 < one["voltage_V"] < 9.0 and one["temperature_degC"] > 0 and one["faults"] == ""
-    assert seven["faults"] == "silent" and seven["position"] is None
-    assert chain.digest() != before
 
 
 def test_the_second_number_of_an_sts_firmware_is_read():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.listen.sound_check import check_sound, judge_sound, level_meter, meter_line
+from sfms_robot.app.listen.sound_check import check_sound, judge_sound
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES
 
@@ -53,15 +53,3 @@ def test_a_recorded_voice_can_be_checked_and_is_shown_as_it_comes():
     assert len(levels) == 10 and told["seconds"] == 0.4 and told["audio"] == "katie"
     with pytest.raises(ConfigError, match="--check: there is nothing to listen to"):
         check_sound("none")
-
-
-@pytest.mark.parametrize(("level_db", "full"), [(-60.0, 0), (-30.0, 20), (0.0, 40), (5.0, 40), (-100.0, 0)])
-def test_the_meter_is_as_full_as_the_sound_is_loud(level_db, full):
-    assert meter_line(level_db, clipped=False).plain[:40] == ("█" * full).ljust(40)
-
-
-def test_a_meter_says_that_it_has_clipped_and_shows_nothing_where_nobody_looks(capsys):
-    assert "clips" in meter_line(-3.0, clipped=True).plain
-    with level_meter() as meter:
-        meter(-20.0, True)
-    assert capsys.readouterr().err == ""
