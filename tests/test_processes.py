@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import sfms_robot
 from sfms_robot import processes
 from sfms_robot.emulator.launch import PROMPT_DEADLINE_S, READ_DEADLINE_S, EmulatedServo, launch
 
@@ -333,13 +332,6 @@ def test_a_process_of_a_pool_computes_with_one_thread(monkeypatch):
     assert {name: os.environ[name] for name in LOOSE} == LOOSE
     monkeypatch.undo()
     assert threads() == (processes.ONE_THREAD, 1)  # nor do workers of pytest use more (conftest.py)
-
-
-def test_every_pool_and_every_pickling_child_of_the_package_is_made_in_one_place():
-    package = Path(sfms_robot.__file__).parent
-    making = ("ProcessPoolExecutor(", "multiprocessing.Pool", "get_context(", "start_new_session=")
-    users = [file.name for file in package.rglob("*.py") if any(word in file.read_text("utf-8") for word in making)]
-    assert [*dict.fromkeys(users)] == ["processes.py"]
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getscheduler"), reason="no real-time priority here")

@@ -8,6 +8,7 @@ from urllib.request import urlopen
 
 import pytest
 from ended import PROGRAM
+from ros2_graph import free_endpoint
 
 from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key, open_fleet
 from sfms_robot.app.listen.knobs import RunControls
@@ -65,6 +66,15 @@ def test_documents_that_are_none_are_counted_and_the_first_is_logged(router, com
     assert [each["name"] for each in ended.told["heads"]] == ["hall"] and ended.told["malformed"] == 4
     (line,) = [each.getMessage() for each in caplog.records]
     assert "sfms/" in line and "only counted" in line
+
+
+@pytest.mark.slow
+def test_a_fleet_without_a_router_is_told_in_one_line(tmp_path, command_line):
+    pytest.importorskip("zenoh", reason="needs the extra [ros2]")
+    file, connect = tmp_path / "robot.json5", {"endpoints": [free_endpoint()], "timeout_ms": -1}
+    file.write_text(json.dumps({"mode": "client", "connect": connect, **ALONE}))
+    ended = command_line("fleet", "--zenoh", file)
+    assert ended.code == 3 and "no answer at" in ended.complaint and "sfms-robot serve" in ended.complaint
 
 
 @pytest.mark.parametrize(

@@ -1,20 +1,15 @@
-"""Every command has --json and prints it in one place, as JSON that a strict reader accepts; no table cuts a row."""
+"""Any result is JSON that a strict reader accepts; no table cuts a row."""
 
-import ast
 import io
 from contextlib import redirect_stdout
-from pathlib import Path
 
 import pytest
-import typer
 from ended import Ended
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sfms_robot.cli import show
-from sfms_robot.cli.main import app
 
-FILES = sorted(Path(show.__file__).parent.glob("*.py"))
 FIGURES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
     lambda inner: st.lists(inner) | st.lists(inner).map(tuple) | st.dictionaries(st.text(), inner),
@@ -41,32 +36,6 @@ def test_any_result_is_one_line_of_json(told):
 @pytest.mark.parametrize("nothing", [float("nan"), None])
 def test_a_cell_without_a_figure_is_a_dash(nothing):
     assert show.cell(nothing) == "-"
-
-
-@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_json_is_printed_in_one_place(file):
-    found = {
-        alias.name
-        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Import)
-        for alias in node.names
-    }
-    assert not found & {"json", "orjson"} or file.stem == "show"
-
-
-def commands(command, words=()):
-    """Yield every command of the program, as (words, command)."""
-    inner = getattr(command, "commands", {})
-    for name, each in inner.items():
-        yield from commands(each, (*words, name))
-    if not inner:
-        yield " ".join(words), command
-
-
-@pytest.mark.parametrize(("words", "command"), [*commands(typer.main.get_command(app))])
-def test_every_command_has_it(words, command):
-    speaks_a_protocol = words == "mcp"  # on its standard output: JSON of its own
-    assert speaks_a_protocol or any("--json" in each.opts for each in command.params), words
 
 
 ROWS = [
