@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from free_ports import free_tcp_port
+from motion_rows import motion
 from websockets.sync.client import connect
 
 from sfms_robot.errors import OutputError
-from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
 from sfms_robot.outputs.reachy_mini import ReachyMini, ReachyMiniOverlay, antennas, in_reach, matrix
 from sfms_robot.outputs.sender import OutputSender
 from sfms_robot.ports import OutputFrame
@@ -94,13 +94,6 @@ def daemon(tmp_path_factory):
     daemon.kill()
 
 
-def face_of(**channels):
-    motion = np.zeros(MOTION_DIM, np.float32)
-    for name, value in channels.items():
-        motion[CHANNEL_INDEX[name]] = value
-    return motion
-
-
 def drive(sender, seconds, face, state="listening"):
     """Step a sender 50 times a second. `face`: motion (58,) by time."""
     began_s, pause = time.monotonic(), threading.Event()
@@ -112,29 +105,29 @@ def drive(sender, seconds, face, state="listening"):
 def finish(sender):
     """Ease a sender to neutral and close its output."""
     while not sender.settled:
-        sender.step(OutputFrame(time_s=0.0, motion=face_of(), state="stopping"), time.monotonic(), ending=True)
+        sender.step(OutputFrame(time_s=0.0, motion=motion(), state="stopping"), time.monotonic(), ending=True)
         threading.Event().wait(0.02)
     sender.output.close()
 
 
 def test_what_is_sent_is_reported_and_a_halt_holds_it(daemon):
     sender = OutputSender(ReachyMini(daemon.address))
-    drive(sender, 7.0, lambda t: face_of(pitch=0.15 * np.sin(4 * t), yaw=0.5 * np.sin(t), roll=0.1 * np.sin(2 * t)))
+    drive(sender, 7.0, lambda t: motion(pitch=0.15 * np.sin(4 * t), yaw=0.5 * np.sin(t), roll=0.1 * np.sin(2 * t)))
     figures = sender.statistics()
     assert figures["losses"] == 0 and figures["pitch_correlation"] >= 0.99 and figures["lag_ms"] <= 120, figures
 
-    held = face_of(roll=0.1, pitch=-0.2, yaw=1.5, z=0.005, browInnerUp=0.5, browOuterUpRight=0.5)
+    held = motion(roll=0.1, pitch=-0.2, yaw=1.5, z=0.005, browInnerUp=0.5, browOuterUpRight=0.5)
     drive(sender, 4.0, lambda t: held)
     pose, body_rad, antennas_rad = daemon.reported()
     assert pose == pytest.approx(matrix(in_reach(held[:6].astype(float))), abs=2e-3)
     assert body_rad == pytest.approx(1.5 - np.radians(40), abs=2e-3)
     assert antennas_rad == pytest.approx(antennas(held), abs=1e-3)
 
-    drive(sender, 0.5, lambda t: face_of(), state="halted")
+    drive(sender, 0.5, lambda t: motion(), state="halted")
     stopped = daemon.reported()[0]
-    drive(sender, 1.0, lambda t: face_of(pitch=0.3), state="halted")
+    drive(sender, 1.0, lambda t: motion(pitch=0.3), state="halted")
     assert daemon.reported()[0] == pytest.approx(stopped, abs=1e-6) and stopped == pytest.approx(pose, abs=0.05)
-    drive(sender, 1.5, lambda t: face_of())
+    drive(sender, 1.5, lambda t: motion())
     finish(sender)
     assert daemon.reported()[0] == pytest.approx(np.eye(4), abs=5e-3)
 
@@ -149,18 +142,18 @@ def test_a_run_reports_how_the_robot_follows(daemon, command_line):
 
 def test_a_move_of_another_program_is_noticed_and_the_robot_eases_in_again(daemon):
     sender, away = OutputSender(ReachyMini(daemon.address)), matrix(np.array([0, 0, 0.8, 0, 0, 0]))
-    drive(sender, 2.5, lambda t: face_of())
+    drive(sender, 2.5, lambda t: motion())
     with connect(f"ws://{daemon.address}/ws/sdk") as other:
         other.send(json.dumps({"type": "goto_target", "head": away.ravel().tolist(), "duration": 3.0}))
         until_s = time.monotonic() + 30.0
         while not sender.lost:
             assert time.monotonic() < until_s, sender.statistics()
-            drive(sender, 0.1, lambda t: face_of(yaw=-0.3))
+            drive(sender, 0.1, lambda t: motion(yaw=-0.3))
         assert sender.statistics()["problem"].startswith(("does not follow", "did not go to neutral"))
     followed = 0
     while followed < 10:  # two seconds: while the other move goes on it is lost again
         assert time.monotonic() < until_s, sender.statistics()
-        drive(sender, 0.2, lambda t: face_of(yaw=-0.3))
+        drive(sender, 0.2, lambda t: motion(yaw=-0.3))
         followed = 0 if sender.lost else followed + 1
     assert daemon.reported()[0] == pytest.approx(matrix(np.array([0, 0, -0.3, 0, 0, 0])), abs=5e-3)
     finish(sender)
@@ -174,7 +167,7 @@ def test_an_app_that_drives_the_robot_stays_in_charge_and_an_overlay_is_added(da
     with connect(f"ws://{daemon.address}/ws/sdk") as app:
         app.send(json.dumps({"type": "set_full_target", "head": by_app.ravel().tolist()}))
         sender = OutputSender(ReachyMiniOverlay(daemon.address))
-        drive(sender, 2.0, lambda t: face_of(pitch=0.2))
+        drive(sender, 2.0, lambda t: motion(pitch=0.2))
         assert daemon.reported()[0] == pytest.approx(nod @ by_app, abs=2e-3)
         finish(sender)
         assert daemon.reported()[0] == pytest.approx(by_app, abs=2e-3)

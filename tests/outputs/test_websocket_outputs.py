@@ -13,6 +13,7 @@ from itertools import count
 import numpy as np
 import pytest
 from free_ports import free_tcp_port
+from motion_rows import motion
 from websockets.exceptions import ConnectionClosed
 from websockets.server import ServerProtocol
 from websockets.sync.server import serve
@@ -34,15 +35,8 @@ AWAKE |= {"backend_status": {"motor_control_mode": "enabled"}}
 HOME = {"type": "head_pose", "head_pose": np.eye(4).tolist()}
 
 
-def motion_of(**channels):
-    motion = np.zeros(MOTION_DIM, np.float32)
-    for name, value in channels.items():
-        motion[CHANNEL_INDEX[name]] = value
-    return motion
-
-
 def frame_of(**channels):
-    return OutputFrame(time_s=0.0, motion=motion_of(**channels), state="listening")
+    return OutputFrame(time_s=0.0, motion=motion(**channels), state="listening")
 
 
 class Fake:
@@ -132,10 +126,10 @@ def answered(output, frame, now_s=0.0, opens=False, step_s=0.0):
 def test_antennas_and_body_move_as_those_of_the_shipped_head():
     retargeter, rng = HeadRetargeter(load_head("reachy_mini")), np.random.default_rng(0)
     for _ in range(50):
-        motion = motion_of(**dict(zip(CHANNELS[6:], rng.random(52), strict=True)), yaw=rng.uniform(-2.5, 2.5))
-        angles = dict(zip(retargeter.joints, retargeter.angles(motion), strict=True))
-        assert antennas(motion) == pytest.approx([angles["right_antenna"], angles["left_antenna"]], abs=1e-6)
-        assert body_yaw(float(motion[2])) == pytest.approx(angles["body_rotation"], abs=1e-6)
+        shown = motion(**dict(zip(CHANNELS[6:], rng.random(52), strict=True)), yaw=rng.uniform(-2.5, 2.5))
+        angles = dict(zip(retargeter.joints, retargeter.angles(shown), strict=True))
+        assert antennas(shown) == pytest.approx([angles["right_antenna"], angles["left_antenna"]], abs=1e-6)
+        assert body_yaw(float(shown[2])) == pytest.approx(angles["body_rotation"], abs=1e-6)
 
 
 def test_every_pose_that_is_sent_is_within_reach_of_the_legs():
@@ -158,8 +152,8 @@ def test_a_lag_is_found_in_what_is_reported():
 
 
 def test_furhat_gets_52_shapes_neck_and_gaze_in_degrees():
-    motion = motion_of(browInnerUp=0.5, tongueOut=1, yaw=0.5, pitch=-0.1, eyeLookOutLeft=0.5, eyeLookInRight=0.5)
-    params = params_of(motion)
+    shown = motion(browInnerUp=0.5, tongueOut=1, yaw=0.5, pitch=-0.1, eyeLookOutLeft=0.5, eyeLookInRight=0.5)
+    params = params_of(shown)
     assert len(params) == len(BLENDSHAPES) + 5
     assert (params["BROW_INNER_UP"], params["TONGUE_OUT"], params["EYE_LOOK_OUT_LEFT"]) == (0.5, 1.0, 0.0)
     assert (params["NECK_PAN"], params["NECK_TILT"]) == (pytest.approx(28.648), pytest.approx(-5.73))
@@ -167,10 +161,10 @@ def test_furhat_gets_52_shapes_neck_and_gaze_in_degrees():
 
 
 def test_vtube_studio_gets_degrees_and_shares_that_are_0_for_a_neutral_face_in_the_mode_add():
-    neutral, added = inputs_of(motion_of()), inputs_of(motion_of(), added=True)
+    neutral, added = inputs_of(motion()), inputs_of(motion(), added=True)
     assert (neutral["EyeOpenLeft"], neutral["MouthSmile"]) == (1.0, 0.5)
     assert set(added.values()) == {0.0}
-    moved = inputs_of(motion_of(yaw=0.5, pitch=0.1, eyeBlinkLeft=1, mouthSmileLeft=1, mouthSmileRight=1))
+    moved = inputs_of(motion(yaw=0.5, pitch=0.1, eyeBlinkLeft=1, mouthSmileLeft=1, mouthSmileRight=1))
     assert (moved["FaceAngleX"], moved["FaceAngleY"]) == (pytest.approx(28.648, abs=1e-3), pytest.approx(-5.73, 1e-3))
     assert (moved["EyeOpenLeft"], moved["EyeOpenRight"], moved["MouthSmile"]) == (0.0, 1.0, 1.0)
 

@@ -322,22 +322,6 @@ def test_no_name_and_no_value_of_a_slider_is_cut_off(own_page, run, size):
     assert len(heights) > 4 and len(set(heights)) == 1  # "as people" takes no more lines than a number
 
 
-def test_the_panel_of_the_curves_ends_below_them_however_long_the_controls_are(page):
-    open_all(page)
-    below = "document.querySelector('#happens').getBoundingClientRect().bottom"
-    feet = "document.querySelector('.timeline-feet').getBoundingClientRect().bottom"
-    assert 0 < page.ask(f"{below} - {feet}") < 20
-
-
-def test_on_a_phone_on_its_side_halting_leaves_the_picture_free(own_page, run):
-    own_page.look((844, 390))
-    page = own_page.open(run.url)
-    width, height = page.ask(
-        "(({width, height}) => [width, height])(document.querySelector('.stop').getBoundingClientRect())"
-    )
-    assert width < 844 / 3 and 48 <= height < 390 / 4
-
-
 def test_halt_stays_where_it_is_whatever_is_told_beside_it(page):
     place = "JSON.stringify(document.getElementById('halt').getBoundingClientRect())"
     before = page.ask(place)

@@ -71,19 +71,6 @@ def test_there_is_room_for_some_and_who_goes_leaves_the_controls():
     assert here.visitors.enter().number == MOST_VISITORS + 1
 
 
-@pytest.mark.parametrize("command", ["halt", "show"])
-def test_with_a_token_who_has_not_shown_it_only_looks(command):
-    here = Here("secret")
-    visitor = here.visitors.enter()
-    with pytest.raises(PacketError, match="the token is needed"):
-        here.visitors.admit(visitor, command)
-    with pytest.raises(PacketError, match="the token is not the one"):
-        here.visitors.greet(visitor, 1, "guess")
-    assert not visitor.allowed
-    here.visitors.greet(visitor, 1, "secret")
-    here.visitors.admit(visitor, command)
-
-
 def test_a_page_of_another_version_is_to_be_loaded_again():
     here = Here()
     with pytest.raises(PacketError, match="version: expected 1, got 0: load the page again"):

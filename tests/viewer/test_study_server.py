@@ -122,19 +122,5 @@ def test_in_a_browser_by_keys(study, tmp_path):
     assert sides == ["left", "right", "neither", "left"]
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(missing() is not None, reason=f"needs {missing()}")
-def test_on_a_phone_both_faces_fill_their_frames(study, tmp_path):
-    with Served(study_app(study)) as served, Page(tmp_path / "chromium", size=(390, 844)) as page:
-        page.driver.get(served.url)
-        page.until("document.querySelectorAll('fieldset').length")
-        for side in ("left", "right"):
-            face = page.picture(side)
-            high, wide = face.shape[:2]
-            assert 1.0 < high / wide < 1.2
-            assert face[-4:, wide // 4 : -wide // 4].max() < 160 < face[:4].min()  # cloth below, ground above
-        assert page.ask("document.documentElement.scrollWidth") <= 390
-
-
 def keys(browser, text):
     browser.find_element("tag name", "body").send_keys(text)
