@@ -310,10 +310,7 @@ def test_nothing_but_events_nods_or_smiles_and_one_to_whom_nothing_happens_still
 
 
 def test_what_is_left_without_the_heads_gaze_does_not_know_where_he_looks(motions):
-    looks = [
-        (at, at + 2.0, where)
-        for at, where in zip(np.arange(2.0, 110, 4), ["side A", "side B", "down"] * 9, strict=True)
-    ]
+    looks = [(2.0 + 4 * at, 4.0 + 4 * at, ("side A", "side B", "down")[at % 3]) for at in range(27)]
     known, left, targets = [], [], []
     for seed in range(8):
         acted = act(score(112, gaze=tuple(looks)), motions["train"], np.random.default_rng(seed))

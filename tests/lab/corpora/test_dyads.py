@@ -26,10 +26,7 @@ def dyad(frames: int = 20, space: str = "arkit58", fps: float = 25.0, **more) ->
 @pytest.mark.parametrize("space", WIDTHS)
 @pytest.mark.parametrize("fps", [25.0, 30.0])
 def test_what_is_saved_is_read_back(tmp_path, space, fps):
-    events = (
-        ListenerEvent("nod", 0.12, 0.8, 0.09, 2),
-        ListenerEvent("gaze_shift", 0.2, 0.4, 0.3, target_rad=(-0.3, 0.05)),
-    )
+    events = ListenerEvent("nod", 0.1, 0.8, 0.09, 2), ListenerEvent("gaze_shift", 0.2, 0.4, 0.3, target_rad=(-0.3, 0.1))
     made = dyad(
         space=space,
         fps=fps,

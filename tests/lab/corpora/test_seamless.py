@@ -134,11 +134,8 @@ def test_every_unit_with_a_shape_moves_it_and_nothing_else():
     for column, unit in enumerate(FAU_VALUE):
         rows = np.zeros((1, 24))
         rows[0, column] = 2.0
-        moved = {
-            name
-            for name in CHANNEL_INDEX
-            if CHANNEL_INDEX[name] >= 6 and blendshapes_of(rows)[0, CHANNEL_INDEX[name] - 6]
-        }
+        shapes = blendshapes_of(rows)[0]
+        moved = {name for name, at in CHANNEL_INDEX.items() if at >= 6 and shapes[at - 6]}
         assert not moved & set(WITHOUT_UNIT)
         assert bool(moved) == (unit not in (23, 25, 30)), unit
     assert blendshapes_of(np.full((1, 24), 9.0)).max() == 1.0 and blendshapes_of(np.full((1, 24), -1.0)).min() == 0.0

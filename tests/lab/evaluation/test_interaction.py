@@ -2,21 +2,18 @@
 
 import numpy as np
 import pytest
+from motion_rows import motions
 from tiny_arig_training import HZ, dyad
 
-from sfms_robot.frames import CHANNEL_INDEX, FRAME_SAMPLES
+from sfms_robot.frames import FRAME_SAMPLES
 from sfms_robot.lab.evaluation import arig_tables as tables
 from sfms_robot.lab.evaluation import interaction as scores
 from sfms_robot.lab.evaluation.metrics import centres_of
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad
 
-JAW = CHANNEL_INDEX["jawOpen"]
-
 
 def jaw(values: np.ndarray) -> np.ndarray:
-    motion = np.zeros((len(values), 58), np.float32)
-    motion[:, JAW] = values
-    return motion
+    return motions(len(values), jawOpen=values)
 
 
 def talk(frames: int = 500, seed: int = 0) -> np.ndarray:

@@ -31,10 +31,7 @@ def test_an_interval_holds_the_truth_at_about_its_level():
 
 
 def test_values_are_those_of_the_sums_and_none_without_a_count_a_second_person_or_most_draws():
-    rows = [
-        {"a": np.array([3.0, 1.0]), "b": np.array([1.0, 2.0])},
-        {"a": np.array([1.0, 3.0]), "b": np.array([3.0, 2.0])},
-    ]
+    rows = [{"a": np.array(a), "b": np.array(b)} for a, b in (([3.0, 1.0], [1.0, 2.0]), ([1.0, 3.0], [3.0, 2.0]))]
     found = estimates({"a": quotient("a"), "a over b": ratio("a", "b")}, rows, seed=1)
     assert (found["a"].value, found["a over b"].value) == (1.0, 1.0)
     found = estimates({"a": quotient("a"), "r": ratio("b", "a")}, [{"a": np.zeros(2), "b": np.ones(2)}] * 5, seed=1)

@@ -7,7 +7,6 @@ import pytest
 
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNELS, FRAME_S
-from sfms_robot.lab.evaluation import metrics
 from sfms_robot.lab.evaluation.motion_metrics import evaluate_metrics
 from sfms_robot.signals.tracks import Track, write_track
 
@@ -30,17 +29,6 @@ def values(result: dict, part: str) -> dict[str, float]:
     return {f"{row['name']}: {row['definition']}": row["value"] for row in result["rows"] if row["part"] == part}
 
 
-def test_rows_are_the_metrics_of_the_package_averaged_over_the_answers(arrays: dict[str, Path]) -> None:
-    result = evaluate_metrics(**arrays)
-    assert (result["space"], result["clips"], result["frames"], result["samples"]) == ("arkit58", N, T, K)
-    truth, answers = np.load(arrays["truth"])[..., 6:], np.load(arrays["prediction"])[..., 6:]
-    found = values(result, "expression")
-    l2, fd = (np.mean([way(truth, answers[:, k]) for k in range(K)]) for way in (metrics.l2, metrics.frechet_distance))
-    assert (found["L2: distance over channels"], found["FD: of all frames"]) == pytest.approx((l2, fd))
-    answers = np.load(arrays["prediction"])
-    assert values(result, "all")["FRDiv: between answers"] == pytest.approx(metrics.frdiv(answers))
-
-
 def test_truth_beside_itself_is_without_distance_and_moves_as_often(arrays: dict[str, Path]) -> None:
     result = evaluate_metrics(**arrays | {"prediction": arrays["truth"]})
     for part in ("expression", "rotation"):
@@ -49,13 +37,6 @@ def test_truth_beside_itself_is_without_distance_and_moves_as_often(arrays: dict
             assert found[name] == pytest.approx(0.0, abs=1e-6), name
     counts = values(result, "all")
     assert counts["blinks a minute: prediction"] == counts["blinks a minute: truth"]
-
-
-def test_a_mean_over_clips_has_an_interval_around_it_and_what_pools_them_has_none(arrays: dict[str, Path]) -> None:
-    rows = evaluate_metrics(**arrays)["rows"]
-    by_clip = next(row for row in rows if row["name"] == "L2")
-    assert by_clip["interval"][0] <= by_clip["value"] <= by_clip["interval"][1]
-    assert next(row for row in rows if row["definition"] == "of all frames")["interval"] is None
 
 
 def test_folders_of_tracks_go_by_name_and_are_cut_alike(tmp_path: Path) -> None:

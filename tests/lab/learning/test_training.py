@@ -45,8 +45,8 @@ def settings(placement: str = "exact", **phases) -> config.Training:
             "predictor_layers": 1,
             "heads": 2,
         },
-        "tokenizer": {"steps": 30, "batch": 8, "learning_rate": 5e-3},
-        "predictor": {"steps": 20, "batch": 8, "learning_rate": 5e-3},
+        "tokenizer": {"steps": 12, "batch": 8, "learning_rate": 5e-3},
+        "predictor": {"steps": 8, "batch": 8, "learning_rate": 5e-3},
     }
     return config.parse(config.Training, raw | phases, "tiny")
 
@@ -77,7 +77,7 @@ def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placemen
     first = tokenizer.train_tokenizer(chosen, data, tmp_path)
     second = listener.train_listener(chosen, data, tmp_path)
     assert np.isfinite([first["loss"], first["mse"], second["loss"], second["held_out_loss"]]).all()
-    assert (first["steps"], second["steps"]) == (30, 20)
+    assert (first["steps"], second["steps"]) == (12, 8)
     calibrate(chosen, data, tmp_path)
     unseen = dyad("c", 160, seed=2)
     (one,) = rollouts(load_folder(tmp_path), [unseen], seed=1)
