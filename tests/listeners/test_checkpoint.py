@@ -62,10 +62,7 @@ SLOTS = "predictor.slots"
         (lambda tensors: tensors["motion_mean"].fill_(torch.nan), "motion_mean holds values that are not finite"),
         (lambda tensors: tensors[SLOTS].fill_(1e30), r"slots holds 1e\+30, no trained model is above 1e\+06"),
         (lambda tensors: tensors.update({SLOTS: tensors[SLOTS].int()}), "slots is of int32, the model needs float32"),
-        (
-            lambda tensors: tensors.update({SLOTS: torch.zeros(8, 5)}),
-            r"shape \(8, 5\), the configuration needs \(8, 16",
-        ),
+        (lambda tensors: tensors.update({SLOTS: torch.zeros(8, 5)}), r"shape \(8, 5\), the configuration needs"),
     ],
 )
 def test_a_tensor_that_does_not_fit_is_named(folder, change, said):

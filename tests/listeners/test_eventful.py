@@ -69,11 +69,8 @@ def test_eyes_go_where_a_gaze_shift_says(lively):
     events = [event for plan in plans for event in plan.events]
     away = [event for event in events if event.kind == "gaze_shift" and np.hypot(*event.target_rad) > 0.1]
     assert away
-    shown = {
-        round(time_s / FRAME_S): row
-        for plan in plans
-        for time_s, row in zip(plan.times_s[:2], plan.frames, strict=False)
-    }
+    both = (row for plan in plans for row in zip(plan.times_s[:2], plan.frames, strict=False))
+    shown = {round(time_s / FRAME_S): row for time_s, row in both}
     for shift in away:
         following = [event.start_s for event in events if event.kind == "gaze_shift" and event.start_s > shift.start_s]
         looks_s = min([*following, 24.0]) - shift.start_s

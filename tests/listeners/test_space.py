@@ -1,7 +1,5 @@
 """Motion spaces of the papers: laws of the conversion, and listeners that work in any of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from tiny_sfms import plans_of, speech, tiny_listener, tiny_settings
@@ -77,19 +75,6 @@ def test_without_a_matrix_pose_and_jaw_alone_move():
     assert shapes[:, BLENDSHAPES.index("jawOpen")] == pytest.approx(0.5)
     assert np.count_nonzero(shapes) == len(frames)
     assert jaw_rad is not None and jaw_rad[:, 1] == pytest.approx(JAW_FULL_OPEN_RAD / 2)
-
-
-def test_expression_comes_back_through_the_matrix():
-    shown = [BLENDSHAPES.index(name) for name in ("mouthSmileLeft", "mouthSmileRight", "browInnerUp", "cheekPuff")]
-    weights = np.zeros((30, 52))
-    weights[:, shown] = RNG.uniform(0.2, 0.9, (30, 1))
-    frames = np.zeros((30, 56))
-    frames[:, :50] = weights @ MATRIX
-    deca = replace(space("deca56"), flame=FlameMatrix(MATRIX))
-    motion, _ = deca.decode(frames)
-    assert deca.limitation is None
-    assert np.abs(motion[:, SHAPES] - weights).mean() < 0.02
-    assert np.abs(motion[:, SHAPES][:, shown] - weights[:, shown]).max() < 0.1
 
 
 def test_solved_weights_are_bounded_and_gaze_stays_still():

@@ -138,15 +138,6 @@ def test_more_of_a_knob_is_never_less_of_its_hazard(rate, times):
     assert (high >= low).all() and high.max() > 0
 
 
-SLOW = [pytest.param(kind, marks=pytest.mark.slow) for kind in ("gaze_shift", "smile", "mm_hm", "tilt")]
-
-
-@pytest.mark.parametrize("kind", ["nod", "blink", *SLOW])
-def test_a_kind_happens_more_often_with_its_knob_and_never_at_nought(kind):
-    counts = [len(of(kind, listen(conversation(), calmness=Calmness(**{kind: knob}))[0])) for knob in (0, 4, 20)]
-    assert counts[0] == 0 and counts[1] < counts[2]
-
-
 # --- who looks --------------------------------------------------------------------------------------------------
 def test_attention_unknown_is_between_flickering_is_none_and_without_a_face_it_is_as_asked_for():
     asks = {
