@@ -129,11 +129,7 @@ def test_licence_goes_along(tmp_path, caplog, command_line):
     [
         ("vico", (), "vico is in deep3d73, which cannot become arkit58"),
         ("seamless", ("--layout", "smell"), "--layout smell: is not known (auto, l2l"),
-        (
-            "seamless",
-            ("--flame-matrix", "m.npy"),
-            "--flame-matrix m.npy: seamless27 has no FLAME expression (deca56 has)",
-        ),
+        ("seamless", ("--flame-matrix", "m.npy"), "m.npy: seamless27 has no FLAME expression (deca56 has)"),
         ("dualtalk", ("--flame-matrix", "m.npy"), "--flame-matrix m.npy: no such file"),
         ("dualtalk", ("--order", "exp-first"), "there is no order to choose"),
     ],

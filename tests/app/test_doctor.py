@@ -221,11 +221,8 @@ def test_without_a_head_everybody_is_listed_at_their_rate():
 @pytest.mark.parametrize("family", servo_families())
 def test_every_model_that_has_a_map_can_be_examined(family):
     maps = [load_firmware_map(file.stem) for file in map_files()]
-    models = [
-        each.model
-        for each in maps
-        if (each.family, each.protocol) == servo_families()[family].maps and not each.variant_of
-    ]
+    served = servo_families()[family].maps
+    models = [each.model for each in maps if (each.family, each.protocol) == served and not each.variant_of]
     servos = [EmulatedServo(i, model, start_ticks=500) for i, model in enumerate(models, start=1)]
     with patient(*servos) as sick:
         wanted = {

@@ -56,11 +56,8 @@ def test_resume_and_end_need_a_proof_of_the_key_which_counts_once(run, command):
 
     nonce = controls.nonce
     other = "end" if command == "resume" else "resume"
-    wrong = [
-        proof(b"x" * 64, "hall", command, nonce),
-        proof(KEY, "attic", command, nonce),
-        proof(KEY, "hall", other, nonce),
-    ]
+    made = (b"x" * 64, "hall", command), (KEY, "attic", command), (KEY, "hall", other)
+    wrong = [proof(*each, nonce) for each in made]
     for each in ({}, {"proof": 3}, {"proof": "\ud800"}, *({"proof": one} for one in wrong)):
         assert "error" in sent(**each) and "\n" not in sent(**each)["error"]
     assert run.halt.by == "kitchen" and not run.interrupt() and controls.nonce == nonce

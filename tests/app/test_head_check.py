@@ -118,11 +118,7 @@ joints:
         ("max_deg: 25,", "max_deg: 25,5,", ["joints.beak: 5 stands alone, without a key: a decimal number is written"]),
         ("max_deg: 25,", "max_deg: '25,5',", ["beak.max_deg = '25,5': a decimal number is written with a point: 25.5"]),
         ("\n  ", "\n  - ", ["joints: expected keys with values, as key: value, got a list: leave out the dashes"]),
-        (
-            "mirror_of: beak",
-            "mirror_of: baek",
-            ["joints.lid.mirror_of = 'baek' is not a joint of this head (", "'beak'?"],
-        ),
+        ("of: beak", "of: baek", ["joints.lid.mirror_of = 'baek' is not a joint of this head (", "'beak'?"]),
         ("xl330-m288", "xl330-m299", ["joints.neck_yaw, beak, lid: model = 'xl330-m299' has no firmware map; did you"]),
         ("dynamixel2", "feetech", ["neck_yaw.model = 'xl330-m288': expected a servo of family feetech, as bus main"]),
         ("unit: rad", "unit: rads", ["neck_yaw.unit = 'rads': Input should be 'range' or 'rad'; did you mean 'rad'?"]),

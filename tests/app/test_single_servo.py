@@ -98,10 +98,8 @@ def test_registers_are_read_by_name_in_raw_and_unit(three):
     (goal, volt) = single.read_registers(wire.find(2), ["present_position", "voltage"])
     assert goal["raw"] == 1500 and goal["value"] == pytest.approx(1500 * 360 / 4096) and goal["unit"] == "deg"
     assert volt["register"] == "present_input_voltage" and volt["unit"] == "V"
-    values, state = (
-        single.read_registers(wire.find(7), ["all"]),
-        single.read_all(wire.find(7)),
-    )  # one by one, and at once
+    values = single.read_registers(wire.find(7), ["all"])  # one by one
+    state = single.read_all(wire.find(7))
     addresses = [each["address"] for each in values]
     assert addresses == sorted(addresses) and len(values) == len(load_firmware_map("xl330-m288").registers)
     for each in values:
@@ -120,12 +118,7 @@ def test_a_ram_register_is_written_unasked_and_eeprom_stays_closed_while_torque_
 def test_a_value_may_carry_the_unit_of_the_register():
     position = Table.of(load_firmware_map("xl330-m288"))["goal_position"]
     assert single.parse_value("m", position, "180deg") == 2048 and single.parse_value("m", position, "-7") == -7
-    for text, problem in (
-        ("180rad", "not a value"),
-        ("1.5", "not a value"),
-        ("x", "not a value"),
-        ("9999999", "range"),
-    ):
+    for text, problem in (("180rad", "not a v"), ("1.5", "not a v"), ("x", "not a v"), ("9999999", "range")):
         with pytest.raises(ConfigError, match=problem):
             single.parse_value("m", position, text)
 
@@ -199,10 +192,8 @@ def test_nothing_changes_when_the_answer_is_no():
         ):
             with pytest.raises(ConfigError, match="not confirmed"):
                 change()
-        assert (
-            wire.find(1).baud == 1_000_000
-            and single.read_registers(wire.find(1), ["return_delay_time"])[0]["raw"] == 250
-        )
+        assert wire.find(1).baud == 1_000_000
+        assert single.read_registers(wire.find(1), ["return_delay_time"])[0]["raw"] == 250
         assert single.write_register(wire.find(1), "return_delay_time", "0us", yes)["raw"] == 0
 
 

@@ -76,12 +76,8 @@ class Daemon:
             while not {"head_pose", "joint_positions"} <= set(found):
                 message = json.loads(client.recv(timeout=5))
                 found[message["type"]] = message
-        joints = found["joint_positions"]
-        return (
-            np.array(found["head_pose"]["head_pose"]),
-            joints["head_joint_positions"][0],
-            joints["antennas_joint_positions"],
-        )
+        pose, joints = found["head_pose"]["head_pose"], found["joint_positions"]
+        return np.array(pose), joints["head_joint_positions"][0], joints["antennas_joint_positions"]
 
 
 @pytest.fixture(scope="module")

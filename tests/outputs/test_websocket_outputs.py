@@ -269,12 +269,8 @@ def test_furhat_is_taken_over_and_given_back(monkeypatch):
         output.close()
         auth, config, pose, params, back = fake.take(5)
         assert auth == {"type": "request.auth", "key": "secret"}
-        assert [config["blinking"], back["blinking"], pose["yaw"], params["params"]["JAW_OPEN"]] == [
-            False,
-            True,
-            0,
-            0.5,
-        ]
+        assert (config["blinking"], back["blinking"]) == (False, True)
+        assert (pose["yaw"], params["params"]["JAW_OPEN"]) == (0, 0.5)
         monkeypatch.setenv("FURHAT_KEY", "wrong")
         with pytest.raises(OutputError, match="refuses access: set FURHAT_KEY"):
             output.open()
@@ -347,10 +343,7 @@ def test_a_token_that_is_not_valid_any_more_is_asked_for_again(tmp_path):
         (Studio(allows=False), "User has denied API access for your plugin (error 50); start the run again"),
         (Studio(version="2.0"), "speaks API version 2.0, not 1.0"),
         (Studio(token="a b"), "gives 'a b', which is not a token"),
-        (
-            Studio(error={"errorID": 454, "message": "Taken."}),
-            "Taken (error 454); stop the other plug-in, or use vtube-",
-        ),
+        (Studio(error={"errorID": 454, "message": "Taken."}), "Taken (error 454); stop the other plug-in, or use"),
     ],
 )
 def test_a_refusal_of_vtube_studio_is_one_line(tmp_path, answers, line):
