@@ -140,14 +140,11 @@ def test_clips_are_made_once(tmp_path):
         prepare(**options_for(tmp_path, ("sfms-small", "arig-small"), voices=2, seed=2))
 
 
-def answers(counts, question="person", left="a", right="b", people=1):
+def answers(counts, question="person", left="a", right="b"):
     """`counts`: chosen -> how often."""
     flat = [chosen for chosen, count in counts.items() for _ in range(count)]
     shared = {"question": question, "left": left, "right": right}
-    return [
-        Preference(participant=f"p{n % people}", trial=n, voice=n, chosen=chosen, **shared)
-        for n, chosen in enumerate(flat)
-    ]
+    return [Preference(participant="p", trial=n, voice=n, chosen=chosen, **shared) for n, chosen in enumerate(flat)]
 
 
 def test_everybody_sees_every_pair_with_every_voice_once_with_even_sides():

@@ -104,11 +104,8 @@ def test_folders_without_such_a_voice_are_named(tmp_path):
 def test_a_face_that_lies_and_attention_that_flickers_bring_no_storm(name, lie):
     """In the motion itself, beside a voice that is as it was."""
     (speaker, *_), rng = robustness.unseen(robustness.voice_folders(None)), np.random.default_rng(1)
-    played = rollout(
-        load_listener(find("listeners", name, "config.yaml")),
-        robustness.heard_and_seen(speaker, "both", lie, MINUTES, rng),
-        range(2),
-    )
+    frames = robustness.heard_and_seen(speaker, "both", lie, MINUTES, rng)
+    played = rollout(load_listener(find("listeners", name, "config.yaml")), frames, range(2))
     for kind, numbers in robustness.counted(played).items():
         assert np.mean(numbers) / MINUTES <= MOST.get(kind.removeprefix("decided_"), 60.0), kind
     assert np.isfinite(played.motion).all()

@@ -98,10 +98,7 @@ def test_motion_and_sway_of_a_dyad_are_its_motion_without_gaze():
 
 @pytest.mark.parametrize(
     "changes, text",
-    [
-        ({"events": None}, "expected events of its listener"),
-        ({"fps": 30.0, "audio": None}, "dyad a: 30 frames a second"),
-    ],
+    [({"events": None}, "expected events of its"), ({"fps": 30.0, "audio": None}, "dyad a: 30 frames a second")],
 )
 def test_a_dyad_without_events_at_our_rate_is_refused(changes, text):
     with pytest.raises(ConfigError, match=text):
