@@ -58,11 +58,7 @@ class Watched:
 
     def strangers(self):
         """Return the addresses beyond loopback, and those at which names are looked up."""
-        return [
-            (host, port)
-            for host, port in self.addressed()
-            if port == NAMES_PORT or not ipaddress.ip_address(host).is_loopback
-        ]
+        return [at for at in self.addressed() if at[1] == NAMES_PORT or not ipaddress.ip_address(at[0]).is_loopback]
 
 
 @pytest.fixture

@@ -51,10 +51,8 @@ def test_of_offered_messages_that_a_full_pipe_cannot_take_the_newest_are_written
 
 def test_messages_of_several_threads_are_never_mixed():
     writer, pipe = writer_and_reader()
-    threads = [
-        threading.Thread(target=lambda byte=byte: [writer.send(byte * 3000) for _ in range(50)])
-        for byte in (b"a", b"b", b"c")
-    ]
+    sends = [lambda byte=byte: [writer.send(byte * 3000) for _ in range(50)] for byte in (b"a", b"b", b"c")]
+    threads = [threading.Thread(target=each) for each in sends]
     for thread in threads:
         thread.start()
     with pipe:

@@ -16,6 +16,7 @@ LIVE = "run --head none --audio none --duration 4 --output "
 READS = "--face live-link:0.0.0.0:1234,flip=yaw"
 TABLE = "evaluate tokenizer --table"
 MINE = "mine"
+BITS = [f"--weight-bits {bits}" for bits in (0, 4, 12, -8)]
 
 # Command, exit code, parts of the line; `{name}` is a place of the fixture `places`.
 CASES = [
@@ -90,10 +91,7 @@ CASES = [
     ("head show face28", 2, ["face28.yaml: head = 'op3_head' is another head (face28)"]),  # its overlay is of another
     ("bench startup --write {tmp}/folder.png", 2, ["--write", "{tmp}/folder.png"]),  # before any work, as the next two
     ("export sfms-small --out {tmp}/file", 2, ["--out", "{tmp}/file"]),
-    *(
-        (f"export sfms-small --out {{tmp}}/w --weight-bits {bits}", 2, [f"--weight-bits {bits}: must be 8, 16 or 32"])
-        for bits in (0, 4, 12, -8)
-    ),
+    *((f"export sfms-small --out {{tmp}}/w {bits}", 2, [f"{bits}: must be 8, 16 or 32"]) for bits in BITS),
     ("servo dump --port sim {tmp}/file", 2, ["{tmp}/file", "is there already"]),
     ("servo restore {tmp}/file --port sim", 2, ["{tmp}/file: expected keys with values"]),
     ("data compose --data {tmp} --out {tmp}/file", 2, ["--out"]),
@@ -123,10 +121,7 @@ CASES = [
     (TABLE + " 3 --train", 2, ["--train needs --models DIR"]),
     (TABLE + " 4 --data {tmp}/folder.png --models {tmp}/m", 2, ["no face tracks (*.csv, *.csv.gz) below it"]),
     ("evaluate tokenizer", 2, ["--data is needed without --table"]),
-    *(
-        (f"fleet {word} halt", 2, [f"fleet halt {word.split()[0]}"])
-        for word in ("--zenoh file.json5", "--json", "--insecure")
-    ),
+    *((f"fleet {each} halt", 2, [f"fleet halt {each[:6]}"]) for each in ("--zenoh file.json5", "--json", "--insecure")),
 ]
 
 

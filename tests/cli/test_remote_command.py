@@ -84,10 +84,7 @@ def test_a_fleet_without_a_router_is_told_in_one_line(tmp_path, command_line):
         (["serve"], "router", "listen", ["tls/192.0.2.1:7447", "udp/[2001:db8::1]:7447?rel=1"]),
         (["run", "--listener", "zenoh/x"], "client", "connect", {"client": ["ws/robot.example:7447#iface=eth0"]}),
         (["run", "--fleet", "hall"], "client", "connect", ["tcp/10.0.0.1:7447"]),
-        *(
-            (["fleet", *more], "client", "connect", ["tcp/10.0.0.1:7447"])
-            for more in ([], ["halt"], ["resume"], ["page"])
-        ),
+        *((["fleet", *more], "client", "connect", ["tcp/10.0.0.1:1"]) for more in ([], ["halt"], ["resume"], ["page"])),
     ],
     ids=lambda each: " ".join(each) if isinstance(each, list) else None,
 )
