@@ -133,10 +133,7 @@ class BadSource(sr.Source):
 
 
 def test_an_error_in_the_loop_surfaces_at_the_end_of_the_block_with_the_head_at_rest():
-    with (
-        pytest.raises(sr.RobotError, match="the browser tab was closed"),
-        sr.Robot(HEAD, source=BadSource(), listener=Nodder()) as robot,
-    ):
+    with pytest.raises(sr.RobotError, match="tab was"), sr.Robot(HEAD, source=BadSource(), listener=Nodder()) as robot:
         robot.wait(30)
         assert robot.state == "fault"
     report = robot.report()
@@ -253,10 +250,7 @@ def test_a_robot_is_halted_and_goes_on_when_it_is_resumed():
 def test_torque_that_is_not_confirmed_off_is_raised_by_the_end_and_in_the_report(opens, tmp_path):
     servos, device = emulated(sr.load_head(HEAD))["main"], str(tmp_path / "servos")
     with launch(servos, link=device) as chain:
-        with (
-            pytest.raises(sr.BusError, match="torque of .* could not be confirmed off"),
-            opens(HEAD, port=device) as robot,
-        ):
+        with pytest.raises(sr.BusError, match="torque .* not be confirmed off"), opens(HEAD, port=device) as robot:
             if opens is sr.open_bus:
                 robot.enable()
             chain.kill(servos[0].id)

@@ -78,16 +78,12 @@ def test_permissions_holders_latency_and_a_udev_rule_come_with_what_to_type():
 
 @pytest.mark.parametrize(
     ("wire", "blamed"),
-    [
-        (FACTORY, "baud"),
-        ({**FACTORY, "baud": BAUD}, "adapter latency"),
-        ({**FACTORY, "baud": BAUD, "latency_ms": 1.0}, "return delay"),
-    ],
+    [(FACTORY, "baud"), ({**TUNED, "latency_ms": 16.0}, "latency"), ({**TUNED, "return_delay_us": 500.0}, "delay")],
 )
 def test_a_bus_that_is_too_slow_is_told_what_takes_the_time(wire, blamed):
     budget = diagnosis.wire_budget("dynamixel2", 25, **wire, read_bytes=4)
     (finding,) = diagnosis.judge_rate(budget, LINE, False)
-    assert finding.severity == "warning" and f"({blamed} takes most)" in finding.problem
+    assert finding.severity == "warning" and f"{blamed} takes most)" in finding.problem
 
 
 def test_findings_alike_are_one_the_worst_come_first_and_an_unknown_model_is_named_once():

@@ -82,10 +82,8 @@ def test_the_report_has_what_it_promises_and_no_wall_clock_figure_of_virtual_tim
     assert bus["writes"] == report["ticks"] <= bus["reads"]
     assert (bus["errors"], bus["silent"], bus["faults"]) == (0, [], [])
     assert report["tick"]["achieved_hz"] is None and report["tick"]["jitter_ms"]["p99"] is None
-    assert report["latency_ms"] == {
-        "frame_to_wire": {"p50": None, "p99": None},
-        "speech_to_wire": {"p50": None, "p95": None},
-    }
+    assert report["latency_ms"]["frame_to_wire"] == {"p50": None, "p99": None}
+    assert report["latency_ms"]["speech_to_wire"] == {"p50": None, "p95": None}
     assert report["listener_step_ms"] == {"p50": None, "p99": None}
 
 

@@ -106,10 +106,7 @@ def answered(listener, now_s):
 
 def test_plans_come_back_and_torch_stays_in_the_child(listener):
     assert answered(listener, 0.0).frames.shape == (8, 58) and listener.statistics()["state"] == "listening"
-    code = (
-        "import sys; from sfms_robot.app import session; from sfms_robot.listeners import process\n"
-        "sys.exit('torch' in sys.modules)"
-    )
+    code = "import sys, sfms_robot.app.session, sfms_robot.listeners.process; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -116,15 +116,10 @@ def test_streams_of_any_age_together_are_each_one_alone(listener):
 
 @given(has=st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), min_size=1, max_size=12))
 def test_any_mix_of_missing_modalities_is_normal(listener, has):
-    speaker = [
-        SpeakerFrame(
-            frame.time_s,
-            frame.audio if audio else frame.audio[:0],
-            frame.face if face else None,
-            frame.agent_audio if agent else None,
-        )
-        for frame, (face, audio, agent) in zip(talk(len(has)), has, strict=True)
-    ]
+    speaker = []
+    for frame, (face, audio, agent) in zip(talk(len(has)), has, strict=True):
+        shown, said = frame.face if face else None, frame.agent_audio if agent else None
+        speaker.append(SpeakerFrame(frame.time_s, frame.audio if audio else frame.audio[:0], shown, said))
     assert all(plan is None or np.isfinite(plan.frames).all() for plan in stream(listener, speaker)[0])
 
 

@@ -166,12 +166,10 @@ def test_random_bytes_to_a_stream_are_not_stepped_but_counted_and_the_first_is_l
 def slow(scale):
     """A millisecond a head and five for any batch, times `scale`."""
     sizes = (1, 2, 4, 8, 16)
-    return Capacity(
-        hop=3,
-        sizes=sizes,
-        plan_s=tuple(scale * (0.005 + 0.001 * n) for n in sizes),
-        other_s=tuple(scale * 1e-4 * n for n in sizes),
+    plan_s, other_s = (
+        tuple(scale * (any_s + each_s * n) for n in sizes) for any_s, each_s in ((5e-3, 1e-3), (0, 1e-4))
     )
+    return Capacity(hop=3, sizes=sizes, plan_s=plan_s, other_s=other_s)
 
 
 def test_heads_are_admitted_until_the_deadline_cannot_be_held_and_the_reason_has_figures():

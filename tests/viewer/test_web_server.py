@@ -170,9 +170,7 @@ def test_beside_400_slow_clients_a_request_is_answered_and_few_stay_open(address
 )
 def test_a_request_that_is_not_whole_in_time_ends_its_connection(sent, monkeypatch):
     monkeypatch.setattr(BriefConnection, "limit_s", CONNECTION_S / 100)
-    with (
-        closing(fleet_page(Fleet(), 0)) as server,
-        socket.create_connection(("127.0.0.1", server.port), LIMIT_S) as client,
-    ):
-        client.sendall(sent)
-        assert to_its_end(client) == b""
+    with closing(fleet_page(Fleet(), 0)) as server:
+        with socket.create_connection(("127.0.0.1", server.port), LIMIT_S) as client:
+            client.sendall(sent)
+            assert to_its_end(client) == b""

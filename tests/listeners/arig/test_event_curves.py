@@ -23,10 +23,8 @@ def test_nothing_told_is_the_one_of_rest_and_events_one_upon_the_other_take_back
     assert found.shape == (3, curves.FEATURES) and bool((found[:, 0] == 1).all()) and not found[:, 1:].any()
     smile, brow = ListenerEvent("smile", 0.2, 3.0, 0.5), ListenerEvent("brow_raise", 1.0, 1.0, 0.5)
     moved = curves.moves(CHANNELS)
-    both, one, other = (
-        curves.remains(rows[:-1], rows[1:], moved)
-        for rows in (rows_of(*some) for some in ((smile, brow), (smile,), (brow,)))
-    )
+    told = [rows_of(*some) for some in ((smile, brow), (smile,), (brow,))]
+    both, one, other = (curves.remains(rows[:-1], rows[1:], moved) for rows in told)
     torch.testing.assert_close(both, one * other)
     model = arig_model(events=True, draws="innovation")
     model.rest_range.fill_(0.1)
