@@ -125,5 +125,7 @@ def test_goal_outside_limits_is_stated_and_no_failure_only_for_corrupted_bytes_w
 @pytest.mark.slow
 @pytest.mark.parametrize("family", FAMILIES)
 def test_whole_campaign(family):
+    """All but the cases that are tried on every family above."""
     ticks = 1000 if family.startswith("maestro") else 500  # a board that fails is reported later
-    assert not [outcome for case in campaign.CASES if not (outcome := campaign.one(family, case, ticks)).passed]
+    others = [case for case in campaign.CASES if case not in (campaign.STORED, campaign.MANY_TURNS, campaign.CORRUPT)]
+    assert not [outcome for case in others if not (outcome := campaign.one(family, case, ticks)).passed]
