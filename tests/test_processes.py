@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import sfms_robot
 from sfms_robot import processes
 from sfms_robot.emulator.launch import PROMPT_DEADLINE_S, READ_DEADLINE_S, EmulatedServo, launch
 
@@ -351,3 +352,10 @@ def test_an_emulated_chain_is_as_prompt_as_hardware_where_the_system_lets_it(vir
         assert chain.read_deadline_s == (PROMPT_DEADLINE_S if here == "fifo" else READ_DEADLINE_S)
         if here == "fifo":
             assert os.sched_getscheduler(chain.pid) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO
+
+
+def test_every_pool_and_every_pickling_child_of_the_package_is_made_in_one_place():
+    package = Path(sfms_robot.__file__).parent
+    making = ("ProcessPoolExecutor(", "multiprocessing.Pool", "get_context(", "start_new_session=")
+    users = [file.name for file in package.rglob("*.py") if any(word in file.read_text("utf-8") for word in making)]
+    assert [*dict.fromkeys(users)] == ["processes.py"]
