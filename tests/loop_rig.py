@@ -106,7 +106,7 @@ def run_listener(
     opened(bus)
     bus.connect()
     try:
-        outcome, log = driven(head, bus, clock, observer=watcher, feed=InlineFeed(listener, 0, 0.01), **how)
+        outcome, log = driven(head, bus, clock, observer=watcher, feed=InlineFeed(listener, 0), **how)
         return Ran(outcome, log, watcher, bus.statistics())
     finally:
         bus.close()

@@ -51,7 +51,6 @@ from sfms_robot.sources.registry import open_source, split_kind
 logger = logging.getLogger(__name__)
 
 LOOK_S: Final = 2.0  # for which a point holds that the peer of an output asks to look at
-FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 
 Panel = Callable[[RunControls], AbstractContextManager[object]]
 
@@ -331,7 +330,7 @@ def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
         from sfms_robot.listeners.registry import engine_name, load_listener  # networks: only here in this process
 
         listener = load_listener(options.listener, calmness=options.calmness, engine=options.engine, threads=1)
-        feed = InlineFeed(listener, options.seed, FAST_LATENCY_S, engine_name(listener))
+        feed = InlineFeed(listener, options.seed, engine_name(listener))
     else:
         feed = begin_listening(options)
     stack.callback(feed.close)

@@ -16,6 +16,7 @@ from typing import Final
 from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Clock, Facts, Listener
 
+FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
 BUSY_S: Final = 0.04  # a tick that is this late shows: a frame of the face
 SHOWN_S: Final = 2.0  # after its last late tick an incident is over
 LOGGED_EVERY_S: Final = 60.0
@@ -118,21 +119,20 @@ class TickPace:
 class InlineFeed:
     """A `ports.PlanFeed` that steps the listener in `push`, so that every run of one seed is the same run.
 
-    A plan becomes visible a fixed `latency_s` after its frame. `engine`: name of the listener's engine for the report.
+    A plan becomes visible `FAST_LATENCY_S` after its frame. `engine`: name of the listener's engine for the report.
     """
 
     lost = False
 
-    def __init__(self, listener: Listener, seed: int, latency_s: float, engine: str | None = None) -> None:
+    def __init__(self, listener: Listener, seed: int, engine: str | None = None) -> None:
         self._listener, self._engine = listener, engine
         self._memory = listener.start(seed)
-        self._latency_s = latency_s
         self._coming: list[tuple[float, Plan]] = []
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
         plan, self._memory = self._listener.step(frame, self._memory)
         if plan is not None:
-            self._coming.append((now_s + self._latency_s, plan))
+            self._coming.append((now_s + FAST_LATENCY_S, plan))
 
     def poll(self, now_s: float) -> Sequence[Plan]:
         visible = [plan for at_s, plan in self._coming if at_s <= now_s]

@@ -76,7 +76,7 @@ def driven(head, servos, seconds, seed, fault=None):
         motion = build_motion(head, rate_hz)
         there = OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
         began_s = clock.now_s()
-        parts, log = run_parts(there, silence, InlineFeed(Restless(), seed, 0.01)), run_log(there)
+        parts, log = run_parts(there, silence, InlineFeed(Restless(), seed)), run_log(there)
         report = drive_head(there, parts, Interrupt(), duration_s=seconds, log=log)
         stand = {name: opened[joint.bus].state(joint.id) for name, joint in head.joints.items()}
     assert (report["exit"], report["error"]) == ("done", None)

@@ -41,7 +41,7 @@ def spoken(*sayings, person=True):
     voice = RecordedVoice(AudioFile(shipped_speaker("katie").audio)) if person else None
     source = PairedSource(voice, None, speech, TALKS_S)
     options = RunOptions(head="interbotix_wxxms", duration_s=TALKS_S, fast=True)
-    report = run(options, source=source, feed=InlineFeed(Posed(), 0, 0.01), signals=False)
+    report = run(options, source=source, feed=InlineFeed(Posed(), 0), signals=False)
     assert report["exit"] == "done"
     return told
 

@@ -74,7 +74,7 @@ def ran(
     bus.connect()
     log = RunLog(joints=list(HEAD.joints), period_s=1 / RATE_HZ, audit=motion.audit)
     parts: dict[str, Any] = {
-        "source": PairedSource(duration_s=SECONDS), "feed": InlineFeed(Posed(yaw=lambda times_s: 0.3), 0, 0.01),
+        "source": PairedSource(duration_s=SECONDS), "feed": InlineFeed(Posed(yaw=lambda times_s: 0.3), 0),
         "timeline": motion.timeline, "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus,
         "life": HeadLife(HEAD.life, 0),
     }  # fmt: skip

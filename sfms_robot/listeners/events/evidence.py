@@ -207,15 +207,6 @@ def done(events: Iterable[ListenerEvent], now_s: float, log_rate: float) -> Doub
     return np.array([since[name] for name in DONE])
 
 
-def begun_before(events: Sequence[ListenerEvent], now_s: float) -> list[ListenerEvent]:
-    """Return the events that had begun before an instant, and may still matter."""
-    return [
-        event
-        for event in events
-        if event.start_s < now_s - EPS_S and (event.end_s > now_s - REMEMBERED_S or event.kind == "gaze_shift")
-    ]
-
-
 def remembered(events: Sequence[ListenerEvent], now_s: float) -> Events:
     """Return the events, in order, that may still matter: those of the last minute, of every kind the newest."""
     newest = {event.kind: event for event in events}

@@ -38,7 +38,6 @@ from sfms_robot.listeners.events.evidence import (
     NUMBERS,
     Sensed,
     SenseMemory,
-    begun_before,
     done,
     remembered,
     sense,
@@ -165,11 +164,11 @@ class HazardBank:
         total = self._intercepts + np.add.reduceat(contributions, self._first_term[:-1], axis=-1)
         return np.asarray(np.minimum(np.maximum(np.where(np.isnan(total), 0.0, total), -_BOUND), _BOUND), np.float64)
 
-    def largest(self, contributions: Doubles, kind: str, most: int = 4) -> dict[str, float]:
-        """Return the largest terms of one kind, by evidence, of terms (T,)."""
+    def largest(self, contributions: Doubles, kind: str) -> dict[str, float]:
+        """Return the four largest terms of one kind, by evidence, of terms (T,)."""
         at = self.kinds.index(kind)
         own = zip(self.terms[at], contributions[self._first_term[at] :].tolist(), strict=False)
-        largest = sorted(own, key=lambda term: -abs(term[1]))[:most]
+        largest = sorted(own, key=lambda term: -abs(term[1]))[:4]
         return {name: round(value, 3) for name, value in largest if value}
 
 
@@ -250,41 +249,33 @@ class EventModel:
         return [(events, changed(own, sensed=heard)) for (events, own), (_, heard) in zip(decided, sensed, strict=True)]
 
     def decide_each(
-        self,
-        sensed: Sequence[Sensed],
-        memories: Sequence[EventMemory],
-        histories: Sequence[Sequence[ListenerEvent]] | None = None,
+        self, sensed: Sequence[Sensed], memories: Sequence[EventMemory]
     ) -> list[tuple[Events, EventMemory]]:
         """Draw the hazards of several streams, all of them together: the second half of `step_each`.
 
-        `histories` replace the streams' own events; events that have not begun by now do not count. A gaze shift away
-        is followed by one back when its time is over.
+        A gaze shift away is followed by one back when its time is over.
         """
         found: list[tuple[Events, EventMemory]] = [((), memory) for memory in memories]
         rows = [row for row, one in enumerate(sensed) if one.frame % STEP_FRAMES == STEP_FRAMES - 1]
         if rows:
-            known = [memory.done for memory in memories]
-            ends_s = [(one.frame + 1) * FRAME_S for one in sensed]
-            if histories is not None:
-                known = [tuple(begun_before(*each)) for each in zip(histories, ends_s, strict=True)]
             learned = self.tables.hazards["nod"].per_minute
             rates = [math.log(memory.calmness.nod or learned) for memory in memories]
-            did = [done(known[row], ends_s[row], rates[row]) for row in rows]
+            did = [done(memories[row].done, (sensed[row].frame + 1) * FRAME_S, rates[row]) for row in rows]
             evidence = np.concatenate([[sensed[row].heard for row in rows], did], axis=1)
             terms = self.bank.contributions(evidence)
             for row, odds, own in zip(rows, self.bank.log_odds(terms), terms, strict=True):
-                found[row] = self._drawn(sensed[row], memories[row], known[row], odds, own)
+                found[row] = self._drawn(sensed[row], memories[row], odds, own)
         return found
 
     def _drawn(
-        self, sensed: Sensed, memory: EventMemory, history: Sequence[ListenerEvent], log_odds: Doubles, terms: Doubles
+        self, sensed: Sensed, memory: EventMemory, log_odds: Doubles, terms: Doubles
     ) -> tuple[Events, EventMemory]:
         """Return the events that are drawn, of log-odds (H,) as learned, and their terms (T,)."""
         now_s = (sensed.frame + 1) * FRAME_S
         odds = [own + more for own, more in zip(log_odds.tolist(), self.asked_odds(memory.calmness), strict=True)]
-        may = _may_happen(sensed, history, now_s)
+        may = _may_happen(sensed, memory.done, now_s)
         draws = uniforms(memory.seed, sensed.frame, Use.EVENT, len(EVENT_KINDS))[self.draws]
-        hazards, events = dict(_NEVER), list(self._look_back(sensed.frame, history, now_s))
+        hazards, events = dict(_NEVER), list(self._look_back(sensed.frame, memory.done))
         for at, kind in enumerate(self.bank.kinds):
             if kind not in may or memory.calmness.per_minute(kind) == 0:
                 continue
@@ -313,7 +304,7 @@ class EventModel:
             for kind in self.bank.kinds
         ]
 
-    def _look_back(self, frame: int, history: Sequence[ListenerEvent], now_s: float) -> Events:
+    def _look_back(self, frame: int, history: Events) -> Events:
         """Return the look back at the person, once looking away is over."""
         shift = last_shift(history)
         if shift is None or shift.target_rad in (None, AT_PERSON) or shift.end_s > _begin_s(frame) + 1e-9:
@@ -353,7 +344,7 @@ def _begin_s(frame: int) -> float:
     return (frame + 1 + LEAD_FRAMES) * FRAME_S
 
 
-def _may_happen(sensed: Sensed, history: Sequence[ListenerEvent], now_s: float) -> frozenset[str]:
+def _may_happen(sensed: Sensed, history: Events, now_s: float) -> frozenset[str]:
     """Return the kinds that may begin at this moment."""
     silence_s, own_s, phrase_s, last_s, smile_s = (sensed.heard.item(AT[name]) for name in _LISTENING)
     listening = silence_s <= LISTENING_S and own_s > 0 and not (math.isnan(phrase_s) and math.isnan(last_s))

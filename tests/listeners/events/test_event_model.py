@@ -19,7 +19,7 @@ from sfms_robot.frames import (
     ListenerEvent,
     SpeakerFrame,
 )
-from sfms_robot.listeners.events.evidence import CORNERS, sense
+from sfms_robot.listeners.events.evidence import CORNERS, EPS_S, sense
 from sfms_robot.listeners.events.model import AT_PERSON, EventModel
 from sfms_robot.signals.event_sizes import RETURN_SIZE
 
@@ -65,7 +65,9 @@ def listen(frames, seed=1, calmness=None, own=None, memory=None):
     hazards = []
     for frame in frames:
         sensed, heard = sense(frame, memory.sensed)
-        ((decided, memory),) = MODEL.decide_each([sensed], [memory], None if own is None else [own])
+        if own is not None:
+            memory = replace(memory, done=tuple(event for event in own if event.start_s < frame.time_s - EPS_S))
+        ((decided, memory),) = MODEL.decide_each([sensed], [memory])
         memory = replace(memory, sensed=heard)
         events += decided
         hazards.append(memory.hazards_hz["nod"])

@@ -129,8 +129,8 @@ def test_done_one_by_one_equals_done_in_whole(seed):
     whole = done_at(spans, (np.arange(2500) + 1) * FRAME_S, 0.8, aside)
     for frame in range(0, 2500, 37):
         now_s = (frame + 1) * FRAME_S
-        row = evidence.done(evidence.begun_before(events, now_s), now_s, 0.8)
-        kept = evidence.done(evidence.remembered(evidence.begun_before(events, now_s), now_s), now_s, 0.8)
+        begun = [event for event in events if event.start_s < now_s - evidence.EPS_S]
+        row, kept = (evidence.done(each, now_s, 0.8) for each in (begun, evidence.remembered(begun, now_s)))
         expected = whole[frame].copy()
         times = [index for index, name in enumerate(evidence.DONE) if name not in evidence.NUMBERS]
         for rows in (row, kept, expected):
