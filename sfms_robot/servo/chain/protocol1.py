@@ -16,7 +16,7 @@ Withholding goals keeps a limp one limp. They have no reboot, and report their f
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar, Final
 
 from sfms_robot.config.wire_time import FRAMINGS
@@ -42,16 +42,12 @@ class Protocol1Link(RegisterLink):
     family: ClassVar[str]
     who_length: ClassVar[int]  # bytes from address 0 on that hold model number and firmware
     refusal_bits: ClassVar[int] = 0  # of the error byte, about the request
+    _packet: Callable[[int, int, bytes], bytes]  # returns a request: servo, instruction, parameters
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         super().__init__(port, baud, silence_s)
         self._owed: dict[int, dict[int, float]] = {}  # servo -> length of an answer -> when it was asked for
         self._echoed = False
-
-    @staticmethod
-    def _packet(servo: int, code: int, params: bytes) -> bytes:
-        """Return a request."""
-        return encode(servo, code, params)
 
     @abstractmethod
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
@@ -188,10 +184,7 @@ class Dynamixel1Link(Protocol1Link):
     framing = FRAMINGS["dynamixel1"]
     who_length = 3
     refusal_bits = protocol1.REFUSAL_BITS
-
-    @staticmethod
-    def _packet(servo: int, code: int, params: bytes) -> bytes:
-        return instruction1(servo, code, params)
+    _packet = staticmethod(instruction1)
 
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
         return protocol1.BULK_READ, protocol1.bulk_read_params((servo, address, length) for servo in servos)
@@ -201,8 +194,7 @@ class Dynamixel1Link(Protocol1Link):
 
     def broadcast_ping(self) -> dict[int, Found]:
         """Ping all 254 ids, one silence each: this protocol has no such request."""
-        ids = range(protocol1.MAX_ID + 1)
-        return {servo: found for servo in ids if (found := self.ping(servo)) is not None}
+        return {servo: found for servo in range(protocol1.MAX_ID + 1) if (found := self.ping(servo)) is not None}
 
 
 class FeetechLink(Protocol1Link):
@@ -215,6 +207,7 @@ class FeetechLink(Protocol1Link):
     family = "feetech"
     framing = FRAMINGS["feetech"]
     who_length = 5
+    _packet = staticmethod(encode)
 
     def _group_request(self, address: int, length: int, servos: Sequence[int]) -> tuple[int, bytes]:
         return protocol1.SYNC_READ, protocol1.sync_read_params(address, length, servos)

@@ -39,8 +39,6 @@ from sfms_robot.errors import PacketError
 PING: Final = 0x01
 READ: Final = 0x02  # address (2), length (2)
 WRITE: Final = 0x03  # address (2), data
-REG_WRITE: Final = 0x04  # kept in the servo until ACTION
-ACTION: Final = 0x05  # carries out what REG_WRITE has left
 FACTORY_RESET: Final = 0x06
 REBOOT: Final = 0x08
 CLEAR: Final = 0x10  # with the key 44 58 4C 22
@@ -178,10 +176,11 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
                 del buffer[:again]
                 continue
             return None
-        if crc16(buffer[: total - 2]) != buffer[total - 2] | buffer[total - 1] << 8:
+        packet = bytes(buffer[:total])
+        if not _proved(packet):
             del buffer[0]
             continue
-        body = bytes(buffer[7 : total - 2])  # instruction, then parameters
+        body = packet[7:-2]  # instruction, then parameters
         if body[0] == STATUS and len(body) < 2:
             del buffer[0]
             continue

@@ -58,13 +58,11 @@ OVERHEAD: Final = 6  # bytes of a frame without its parameters
 MAX_PARAMS: Final = 0xFF - 2
 MAX_FRAME: Final = OVERHEAD + MAX_PARAMS
 
-# Error byte of Dynamixel 1.0 (e-manual "Status Packet: Error"): four bits are about the request, three about the servo.
-VOLTAGE: Final = 0x01  # bit 0, of both families
+# Error byte of Dynamixel 1.0 (e-manual "Status Packet: Error"): four bits are about the request; 0, 2 and 5 about the
+# servo (voltage, overheating, overload). Feetech's are all states of the servo: none says that a request was refused.
 ANGLE_LIMIT: Final = 0x02  # bit 1: the goal is outside the angle limits
-OVERHEATING: Final = 0x04  # bit 2, of both families
 RANGE: Final = 0x08  # bit 3: a parameter is out of range
 CHECKSUM: Final = 0x10  # bit 4
-OVERLOAD: Final = 0x20  # bit 5, of both families
 INSTRUCTION: Final = 0x40  # bit 6: unknown instruction, or ACTION without REG WRITE; bit 7 is always 0
 
 REFUSALS: Final[Mapping[int, str]] = {
@@ -73,11 +71,8 @@ REFUSALS: Final[Mapping[int, str]] = {
     CHECKSUM: "checksum error",
     INSTRUCTION: "instruction error",
 }
-REFUSAL_BITS: Final = ANGLE_LIMIT | RANGE | CHECKSUM | INSTRUCTION
+REFUSAL_BITS: Final = sum(REFUSALS)
 
-# Status byte of Feetech: states of the servo, in every answer. No bit says that a request was refused.
-ENCODER: Final = 0x02
-CURRENT: Final = 0x08
 CALIBRATE_HERE: Final = 128  # written to `torque_enable` of an STS: the present position becomes the middle
 
 _HEADER: Final = b"\xff\xff"
