@@ -19,7 +19,8 @@ instead of steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from sfms_robot.config.wire_time import BITS
@@ -40,9 +41,6 @@ _SLOW_RAD_S: Final = 3.5  # a slow hobby servo under load: 0.3 s for 60 degrees
 _LONGEST_TRAVEL_S: Final = 0.7  # no joint delays `enable` for longer
 _PULSE_FRAME_S: Final = 0.02  # an SSC-32 sends a pulse this often: lines within need not be drawn
 _LONGEST_LINE_S: Final = 0.5
-
-Exchange = Callable[[bytes, int], bytes | None]
-"""Sends a request; returns the answer, if exactly that many bytes came."""
 
 
 class RateLimitedPort:
@@ -107,7 +105,7 @@ class RateLimitedPort:
         return bytes(self._answer) if len(self._answer) == self._length else b""
 
     def exchange(self, request: bytes, length: int) -> bytes | None:
-        """Send a request and return the answer; None if there is none. Blocks until it is overdue at most."""
+        """Send a request; return the answer, None unless exactly `length` bytes came. Blocks until it is overdue."""
         self.request(request, length)
         return self.answer(block=True) or None
 
@@ -146,29 +144,26 @@ class PulseOutput:
         self.fault: str | None = None
 
 
+@dataclass(frozen=True)
 class Maestro:
     """The bytes to and from a Pololu Maestro, with the compact protocol.
 
-    Args:
+    Attributes:
         table: of its model.
         crc: its setting "Enable CRC" is on, the head's file says.
-
-    Attributes:
         status_length: bytes of the answer to `status_request`.
         factory_us: (shortest, longest) pulse that its factory settings allow, if they are narrower than the board.
         reports_pulses: whether `read_pulses` works.
     """
 
+    table: Table
+    crc: bool
     status_length = 2
     factory_us = maestro.FACTORY_PULSE_US
     reports_pulses = True
 
-    def __init__(self, table: Table, crc: bool) -> None:
-        self._table = table
-        self._crc = crc
-
     def _sealed(self, command: bytes) -> bytes:
-        return maestro.sealed(command) if self._crc else command
+        return maestro.sealed(command) if self.crc else command
 
     def status_request(self, restarted: bool) -> bytes:
         """Return a request for the status; `restarted`: the board may have been off since it last answered."""
@@ -177,13 +172,13 @@ class Maestro:
     def decode_status(self, answer: bytes) -> BoardStatus | None:
         """Return the status in an answer; None for bytes that are not an answer."""
         bits = int.from_bytes(answer, "little")
-        if len(answer) != self.status_length or bits >> (max(self._table.faults, default=15) + 1):
+        if len(answer) != self.status_length or bits >> (max(self.table.faults, default=15) + 1):
             return None
-        return BoardStatus(", ".join(self._table.faults_in(bits)), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
+        return BoardStatus(", ".join(self.table.faults_in(bits)), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
 
     def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
         """Return what moves channels to `ticks`; the goals before were sent `interval_s` ago, 0 for the first."""
-        grouped = (self._table.channels or 0) > _MICRO  # one command can move neighbouring channels
+        grouped = (self.table.channels or 0) > _MICRO  # one command can move neighbouring channels
         runs = consecutive(ticks) if grouped else [[channel] for channel in sorted(ticks)]
         commands = (
             maestro.set_targets(run[0], [ticks[channel] for channel in run])
@@ -198,17 +193,17 @@ class Maestro:
         off = b"".join(self._sealed(maestro.set_target(channel, maestro.OFF)) for channel in channels)
         return bytes([maestro.BAUD_INDICATION] * restarted) + off
 
-    def misfit(self, exchange: Exchange, present: bool) -> str | None:
+    def misfit(self, wire: RateLimitedPort, present: bool) -> str | None:
         """Return how the board's settings differ from the head's file, and the cure; None if they do not.
 
         `present`: it has answered `status_request`.
         """
 
         def answers(request: bytes) -> bool:
-            return self.decode_status(exchange(request, self.status_length) or b"") is not None
+            return self.decode_status(wire.exchange(request, self.status_length) or b"") is not None
 
         question = maestro.get_errors()
-        if not self._crc:
+        if not self.crc:
             differs = not present and any(answers(maestro.sealed(question)) for _ in range(_CRC_TRIES))
             return f"expects a CRC: set crc: true {_CURE}" if differs else None
         if answers(question):
@@ -216,11 +211,11 @@ class Maestro:
         answers(bytes([maestro.crc7(question)]))  # the board has been waiting for it
         return None
 
-    def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
+    def read_pulses(self, wire: RateLimitedPort, channels: Sequence[int]) -> dict[int, int] | None:
         """Return ticks of the pulses it sends now, 0 for none; None if a channel is not answered."""
         pulses = {}
         for channel in channels:
-            answer = exchange(self._sealed(maestro.get_position(channel)), 2)
+            answer = wire.exchange(self._sealed(maestro.get_position(channel)), 2)
             if answer is None:
                 return None
             pulses[channel] = int.from_bytes(answer, "little")
@@ -253,11 +248,11 @@ class Ssc32:
         """Return the command, always behind a carriage return: another thread may have been in the middle of a line."""
         return b"\r" + ssc32.outputs_low(channels)
 
-    def misfit(self, exchange: Exchange, present: bool) -> str | None:
+    def misfit(self, wire: RateLimitedPort, present: bool) -> str | None:
         """Return None: it has no settings that could differ."""
         return None
 
-    def read_pulses(self, exchange: Exchange, channels: Sequence[int]) -> dict[int, int] | None:
+    def read_pulses(self, wire: RateLimitedPort, channels: Sequence[int]) -> dict[int, int] | None:
         """Return None."""
         return None
 
@@ -285,7 +280,7 @@ def answers(board: Maestro | Ssc32, wire: RateLimitedPort, tries: int = 2 * TRIE
 def board_problem(table: Table, board: Maestro | Ssc32, wire: RateLimitedPort) -> str | None:
     """Return why a head cannot run with what answers on a port, None if it can: the rule of run and doctor."""
     there = answers(board, wire)
-    if misfit := board.misfit(wire.exchange, there):
+    if misfit := board.misfit(wire, there):
         return f"the {table.model} {misfit}"
     return None if there else f"no {table.model} answers"
 

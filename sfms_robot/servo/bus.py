@@ -301,5 +301,4 @@ class AbsentBus:
 
     def statistics(self) -> Facts:
         """Return the counters of the report."""
-        faults = [f"{joint}: {LEFT_OUT}" for joint in self.joints]
-        return {**dict.fromkeys(COUNTS, 0), "silent": [], "faults": faults}
+        return {**dict.fromkeys(COUNTS, 0), "silent": [], "faults": [f"{joint}: {LEFT_OUT}" for joint in self.joints]}

@@ -69,13 +69,16 @@ class Holder:
     command: str
 
 
+Listing = Callable[[], Iterable[Any]]  # of pyserial's `ListPortInfo`s
+
+
 def _pyserial_ports() -> Iterator[Any]:
     from serial.tools.list_ports import comports
 
     yield from comports()
 
 
-def list_ports(root: Path = ROOT, listed: Callable[[], Iterable[Any]] = _pyserial_ports) -> list[SerialDevice]:
+def list_ports(root: Path = ROOT, listed: Listing = _pyserial_ports) -> list[SerialDevice]:
     """Return the serial ports that servos may be connected to, by path; no built-in ttyS without hardware.
 
     `listed`: returns pyserial's `ListPortInfo` of each port, from which come the facts of USB adapters.
@@ -102,7 +105,7 @@ def ports_data() -> list[Report]:
     ]
 
 
-def describe(path: str, root: Path = ROOT, listed: Callable[[], Iterable[Any]] = _pyserial_ports) -> SerialDevice:
+def describe(path: str, root: Path = ROOT, listed: Listing = _pyserial_ports) -> SerialDevice:
     """Return what the system knows of a port; `path` may be a link to it."""
     real = _real(path)
     return _described(real, next((port for port in listed() if _real(port.device) == real), None), root)
@@ -130,7 +133,7 @@ def _described(path: str, port: Any, root: Path) -> SerialDevice:
     return replace(known, vendor=vendor, product=product, serial=port.serial_number or None, description=description)
 
 
-def stable_name(device: str, root: Path = ROOT, listed: Callable[[], Iterable[Any]] = _pyserial_ports) -> str:
+def stable_name(device: str, root: Path = ROOT, listed: Listing = _pyserial_ports) -> str:
     """Return the name under which an adapter is found again after it was unplugged, or `device` itself.
 
     That is by serial number if the adapter has a unique one. Two CH340 have none, and two CP2102 both have 0001: their

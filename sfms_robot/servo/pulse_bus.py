@@ -81,8 +81,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         confirmed: bool = False,
         rest_rad: Doubles | None = None,
     ) -> None:
-        patience_s = max(read_deadline_s, _LEAST_PATIENCE_S)
-        super().__init__(name, servos, conversion, open_port, baud, patience_s, config)
+        super().__init__(name, servos, conversion, open_port, baud, max(read_deadline_s, _LEAST_PATIENCE_S), config)
         self._reconnect_s = max(config.reconnect_s, _LEAST_RECONNECT_S)
         self.capabilities = dict.fromkeys(self.joints, _CAPABILITIES)
         self._confirmed = confirmed
@@ -133,16 +132,17 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _open(self) -> RateLimitedPort:
         return RateLimitedPort(self._open_port(), self._baud, self._read_deadline_s)
 
-    def _absent(self, wire: RateLimitedPort, problem: str = "") -> BusError:
-        problem = problem or f"no {self.model} answers"
+    def _absent(self, wire: RateLimitedPort, problem: str) -> BusError:
         return BusError(f"bus {self.name!r} on {wire.port.name} at {self._baud} baud: {problem}")
 
-    def _present(self, wire: RateLimitedPort) -> bool:
-        return answers(self._board, wire)
+    def _check_present(self, wire: RateLimitedPort) -> None:
+        """Raise BusError if the board does not answer."""
+        if not answers(self._board, wire):
+            raise self._absent(wire, f"no {self.model} answers")
 
     def _read_pulses(self, wire: RateLimitedPort) -> bool:
         """Read the pulses that the board sends; return whether it reported them."""
-        pulses = self._board.read_pulses(wire.exchange, [output.channel for output in self._outputs])
+        pulses = self._board.read_pulses(wire, [output.channel for output in self._outputs])
         if pulses is not None:
             for output in self._outputs:
                 output.pulse = pulses[output.channel]
@@ -165,11 +165,9 @@ class PulseBus(WireBus[RateLimitedPort]):
             warning = "bus %r: servos on a %s report no position; each jumps to its first pose: keep clear"
             log.warning(warning, self.name, self.model)
             self._warned = True
-        if not self._present(wire):
-            raise self._absent(wire)
+        self._check_present(wire)
         held = [self._switch_on(wire, output) for output in map(self._output, joints)]
-        if not self._present(wire):
-            raise self._absent(wire)
+        self._check_present(wire)
         self._check_latch()
         return np.array(held)
 
@@ -197,8 +195,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         if output.pulse and new:  # the first goal is the pulse that the board sends already, inside the limits
             ticks = self._ticks.copy()
             ticks[index] = output.pulse
-            angles = self._goals.own.nearest(self._conversion.to_rad(ticks))
-            self._ticks = self._conversion.to_ticks(angles)
+            self._ticks = self._conversion.to_ticks(self._goals.own.nearest(self._conversion.to_rad(ticks)))
         self._send(wire, [output])
         if new and output.pulse != self._ticks[index]:
             start_s = wire.port.now_s()
@@ -215,8 +212,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     @property
     def _off(self) -> list[int]:
         """Return the channels that have to be off now."""
-        off = [each.channel for each in self._outputs if each.resting or (self._latched and each.releases)]
-        return sorted(off)
+        return sorted(each.channel for each in self._outputs if each.resting or (self._latched and each.releases))
 
     def release(self, joints: Sequence[str]) -> None:
         """End the pulses of `joints` now; the others continue. The next `poll` repeats it. From any thread."""
@@ -300,7 +296,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             wire.wait(min(wire.busy_until_s, until_s))
             if wire.port.now_s() >= until_s:
                 break
-            pulses = self._board.read_pulses(wire.exchange, channels)
+            pulses = self._board.read_pulses(wire, channels)
             on = {channel for channel, ticks in (pulses or {}).items() if ticks}
             # A board that cannot report its pulses confirms by any answer; a lost answer of another one does not.
             if pulses is None and (self._board.reports_pulses or not answers(self._board, wire, 1, True)):

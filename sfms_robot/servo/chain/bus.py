@@ -447,8 +447,7 @@ class ChainBus(WireBus[RegisterLink]):
         stamp_s = self._stamp_s if self._link is not None else self._now_s()
         for index in self._arrived:
             self._hold(index)
-        faults = [member.fault for member in self._members]
-        return self._telemetry.readings(self.joints, faults, self._arrived, stamp_s)
+        return self._telemetry.readings(self.joints, [member.fault for member in self._members], self._arrived, stamp_s)
 
     def _bring_back(self, link: RegisterLink, now_s: float) -> None:
         """Take a poll's share of the jobs of members on their way back; a silence ends it."""

@@ -182,8 +182,7 @@ class RegisterLink(ABC):
         """
         if alone and self._left_s < self.silence_s:
             return False
-        allowance_s = min(self.silence_s, self._left_s)
-        return self.port.now_s() + bytes_on_wire * self._byte_s + allowance_s <= self._end_s
+        return self.port.now_s() + bytes_on_wire * self._byte_s + min(self.silence_s, self._left_s) <= self._end_s
 
     def grants(self, purpose: str, bytes_on_wire: int, alone: bool = False, late_s: float = LATE_S) -> bool:
         """Return `affords`; a purpose that was refused for `late_s` gets one request, whatever is left.

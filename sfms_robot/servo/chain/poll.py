@@ -101,8 +101,7 @@ class StatusPoll:
         framing: Framing,
     ) -> None:
         self._bus = bus
-        self._members = list(members)
-        self._ids = [member.id for member in members]
+        self._members = members
         self._by_id = {member.id: member for member in members}
         self._telemetry = telemetry
         self._config = config
@@ -130,7 +129,7 @@ class StatusPoll:
         self._polls = 0
         self._turn = 0
         self._flagged: set[int] = set()  # ids whose status says that something is wrong
-        self._missing = set(self._ids)  # ids of members that have to be notified when they answer
+        self._missing = set(self._by_id)  # ids of members that have to be notified when they answer
         self._answered: list[int] = []  # ids that answered in this poll, and may be asked for more
         self._plan()
 
@@ -155,7 +154,7 @@ class StatusPoll:
 
     def _plan(self) -> None:
         """Compute how many whole blocks fit into a tick, and the budget of a poll."""
-        telemetry, config, count = self._telemetry, self._config, len(self._ids)
+        telemetry, config, count = self._telemetry, self._config, len(self._members)
         (_, position), (_, block) = telemetry.position, telemetry.block
         byte_s, way = BITS / config.baud, "fast" if self._fast else self._way
         spare_s = USE / config.rate_hz - self._framing.goals(count, telemetry.goal.size) * byte_s
@@ -188,7 +187,7 @@ class StatusPoll:
     def step(self, now_s: float) -> bool:
         """Read all listed servos, and probe others; return whether any answered. Raises BusError if the port fails."""
         telemetry, listed = self._telemetry, self._listed()
-        whole = not self._grouped or self._blocks >= len(self._ids)
+        whole = not self._grouped or self._blocks >= len(self._members)
         where = telemetry.block if whole else telemetry.position
         outcome = self._read_all(where, listed) if self._grouped else self._read_in_turn(listed)
         answers = outcome.answers
@@ -296,7 +295,7 @@ class StatusPoll:
     def _read_in_turn(self, ids: Sequence[int]) -> PollOutcome:
         """Read servos one by one, as many per poll as its share of a tick allows, from where the last poll ended."""
         out, where = PollOutcome(), self._telemetry.block
-        count = len(self._ids)
+        count = len(self._members)
         order = sorted(ids, key=lambda servo: (self._by_id[servo].index - self._turn) % count)
         for number, servo in enumerate(order[: self._many]):
             if number and not self.link.affords(self._bytes(1, where[1]), alone=True):
@@ -443,8 +442,7 @@ class StatusPoll:
 class Rotation:
     """A rotation that gives turns to servos, `count` at a time."""
 
-    def __init__(self) -> None:
-        self._next = 0
+    _next = 0
 
     def take(self, servos: Sequence[int], count: int) -> list[int]:
         """Return the next `count` of `servos`, in their order; one that is missing from the list loses no turn."""

@@ -20,7 +20,6 @@ from sfms_robot.servo.chain.link import Answer, Answers, Found, RegisterLink, Si
 from sfms_robot.servo.chain.sdk_packets import read2, sync_read2
 from sfms_robot.servo.chain.startup import Startup
 from sfms_robot.servo.codecs import dxl2
-from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Table, Values
 from sfms_robot.servo.stored_settings import contradictions
 
@@ -40,10 +39,7 @@ class Dynamixel2Link(RegisterLink):
 
     framing = FRAMINGS["dynamixel2"]
     has_fast_read = True
-
-    def __init__(self, port: Port, baud: int, silence_s: float) -> None:
-        super().__init__(port, baud, silence_s)
-        self._extra = 0  # bytes that reads of several servos ask for besides what is wanted
+    _extra = 0  # bytes that reads of several servos ask for besides what is wanted
 
     # --- one servo ----------------------------------------------------------------------------------------------
 

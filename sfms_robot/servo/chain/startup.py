@@ -41,13 +41,7 @@ from sfms_robot.servo.bus import tick_ranges
 from sfms_robot.servo.chain.link import TRIES, Found, RegisterLink, Silent, Steps, finish, verified_write
 from sfms_robot.servo.policy import BusServo, torque_limit
 from sfms_robot.servo.registers import Field, Table, Values, span_of
-from sfms_robot.servo.stored_settings import (
-    JointNeeds,
-    contradictions,
-    limit_names,
-    limits_count,
-    operating_mode,
-)
+from sfms_robot.servo.stored_settings import JointNeeds, contradictions, limit_names, limits_count, operating_mode
 
 log = logging.getLogger(__name__)
 
