@@ -102,7 +102,7 @@ class EmulatedWire:
 
     def __init__(self, devices: Sequence[EmulatedDevice], timing: Timing, faults: Iterable[Fault], seed: int) -> None:
         self.hung = False
-        self._devices = list(devices)
+        self._devices = devices
         self._on_the_wire = timing == "wire"
         self.faults = WireFaults(seed)
         self._inbox: deque[tuple[float, bytes, int | None]] = deque()  # (arrives at, data, baud), in that order

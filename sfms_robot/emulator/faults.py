@@ -37,6 +37,7 @@ class Kind(NamedTuple):
 
 _OF_REPLIES: Final = Kind("fraction of replies")
 _OF_REQUESTS: Final = Kind("fraction of requests", ids=False)
+_STATE: Final = Kind("")
 TO_SERVOS: Final = "request-"  # kinds of faults between host and servos begin with this; the others hit replies
 KINDS: Final[dict[str, Kind]] = {
     "drop": _OF_REPLIES,
@@ -49,11 +50,11 @@ KINDS: Final[dict[str, Kind]] = {
     "request-drop": _OF_REQUESTS,
     "request-corrupt": _OF_REQUESTS,
     "request-delay": Kind("seconds", 0.02, 0.0, 60.0, ids=False),
-    "silent": Kind(""),
-    "mute": Kind(""),
-    "stuck": Kind(""),
-    "overload": Kind(""),
-    "overheat": Kind(""),
+    "silent": _STATE,
+    "mute": _STATE,
+    "stuck": _STATE,
+    "overload": _STATE,
+    "overheat": _STATE,
     "load": Kind("fraction of full torque", 0.1, -1.0, 1.0),
     "voltage": Kind("volts", 0.0, 0.0, 60.0, ids=False),
     "brownout": Kind("volts", 0.0, 0.0, 60.0, lasts_s=0.2, ids=False),

@@ -274,5 +274,4 @@ def _check(servos: Sequence[EmulatedServo], maps: Sequence[FirmwareMap]) -> None
             if register is None:
                 raise _refusal("register", name, f"is not a register of {servo.model}", table.registers)
             if not register.low <= value <= register.high:
-                allowed = [f"{register.low}..{register.high}"]
-                raise _refusal(name, value, f"is out of range of {servo.model}", allowed)
+                raise _refusal(name, value, f"is out of range of {servo.model}", [f"{register.low}..{register.high}"])

@@ -107,8 +107,7 @@ class EmulatedBoard(EmulatedDevice):
     """
 
     def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:
-        if table.channels is None or table.pulse_us is None or table.tick_us is None:
-            raise ValueError(f"{table.model} is not a servo board")
+        assert table.channels is not None and table.pulse_us is not None
         self.table = table
         self.errors = 0
         starts = {servo.id: servo.start_ticks for servo in servos}

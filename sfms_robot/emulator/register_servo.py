@@ -91,9 +91,7 @@ class RegisterServo(ABC):
         for name, value in what.registers.items():
             self._put(name, value)
         self._stored = bytes(self._memory.raw)
-        self._mode = mode_of(self._memory)
-        self.frame = ServoFrame(self._memory, self._mode)
-        shaft = self.frame.shaft(float(what.start_ticks))
+        shaft = ServoFrame(self._memory, mode_of(self._memory)).shaft(float(what.start_ticks))
         self.plant = Plant(shaft, reference=shaft)
         highest = self._volts("max_voltage_limit")
         usual = next((volts for limit, volts in _SUPPLIES if highest <= limit), 24.0)
@@ -330,9 +328,10 @@ class RegisterServo(ABC):
         elif not self._by_time and wanted.keys() == {"goal_position"}:  # comes in every tick
             if self.drive is not None and self._mode in POSITIONING:
                 goal = self.frame.shaft(float(self._get("goal_position")))
-                self.drive = self.drive._replace(goal=self._stepped(wanted) if self._mode is Mode.STEP else goal)
+                stepped = self._stepped(wanted["goal_position"])
+                self.drive = self.drive._replace(goal=stepped if self._mode is Mode.STEP else goal)
             return
-        self._settings(self._stepped(wanted))
+        self._settings(wanted.get("goal_position", 0))
         if wanted.keys() & {"min_voltage_limit", "max_voltage_limit"}:
             self._watch_supply()
 
@@ -345,10 +344,10 @@ class RegisterServo(ABC):
         end = field.address + field.size
         self._stored = self._stored[: field.address] + bytes(self._memory.raw[field.address : end]) + self._stored[end:]
 
-    def _stepped(self, wanted: Values) -> float:
-        """Return where the steps written so far lead in step mode, in shaft ticks."""
+    def _stepped(self, step: int) -> float:
+        """Return where the steps written so far and another one lead in step mode, in shaft ticks."""
         start = self.drive.goal if self.drive is not None and self._mode is Mode.STEP else self.plant.position
-        return start + wanted.get("goal_position", 0)
+        return start + step
 
     def _torque_written(self, value: int, locked: bool) -> None:
         """Do what else a write to torque enable does."""
@@ -400,10 +399,9 @@ class RegisterServo(ABC):
         self._put("firmware_major", self.firmware)
         self._put("endianness_flag", int(self.table.byte_order == "big"))
 
-    def _settings(self, stepped: float | None = None) -> None:
-        """Take over what the registers say now. `stepped`: as `_stepped`; None: no step was written."""
-        get = self._get
-        stepped = self._stepped({}) if stepped is None else stepped
+    def _settings(self, step: int = 0) -> None:
+        """Take over what the registers say now. `step`: was written just now, in step mode."""
+        get, stepped = self._get, self._stepped(step)
         self.id = get("id")
         second = get("secondary_id", 255)
         self.second_id = second if second <= dxl2.MAX_ID and second != self.id else None

@@ -47,7 +47,7 @@ class ServoChain(EmulatedDevice, Generic[S]):
     _bulk_write: int | None = None  # an instruction of Protocol 2.0
     _slot_s = 0.0  # answers to a broadcast come in the order of ids, each in its own slot
 
-    def __init__(self, servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool = True) -> None:
+    def __init__(self, servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool) -> None:
         self.servos: list[S] = [self._servo_class(servo, tables[servo.model]) for servo in servos]
         self.chain_break = chain_break
         self._buffer = bytearray()
@@ -144,8 +144,7 @@ class ServoChain(EmulatedDevice, Generic[S]):
 
     def _number(self, params: bytes, index: int) -> int:
         """Return an address or a length. Raises IndexError where it is missing."""
-        place = index * self._width
-        return sum(params[place + i] << 8 * i for i in range(self._width))
+        return sum(params[index * self._width + i] << 8 * i for i in range(self._width))
 
     def _sync_writes(self, params: bytes) -> Iterator[Request[bytes]]:
         """Yield (id, address, data) of a sync write: address, length, then id and data of each."""
@@ -243,8 +242,8 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
 
     def _bulk_reads(self, params: bytes) -> list[Request[int]]:
         # id, address (2), length (2) of each
-        rows = [(params[i], params[i + 1 :]) for i in range(0, len(params), 5)]
-        return [(servo_id, self._number(where, 0), self._number(where, 1)) for servo_id, where in rows]
+        rows = [params[i:] for i in range(0, len(params), 5)]
+        return [(row[0], self._number(row[1:], 0), self._number(row[1:], 1)) for row in rows]
 
     def _together(self, answers: Sequence[Reply | None]) -> Iterator[Reply]:
         """Yield the one packet that comes of all: they talk at once."""
@@ -318,8 +317,7 @@ class Protocol1Servo(RegisterServo):
     def _torque_written(self, value: int, locked: bool) -> None:
         """Take the present position for the middle at 128 (Feetech); clear an overload when torque comes on."""
         if value == protocol1.CALIBRATE_HERE and "homing_offset" in self.table.fields:
-            one_turn = round(self.plant.position % self.table.ticks_per_revolution)
-            self._put("homing_offset", one_turn - _CENTER_ON_STS)
+            self._put("homing_offset", round(self.plant.position % self.table.ticks_per_revolution) - _CENTER_ON_STS)
             if not locked:
                 self._keep(self.table["homing_offset"])
             self._put("torque_enable", 0)
