@@ -89,13 +89,13 @@ class EventKind:
     whole: bool
 
 
-_CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
+CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
 
 # Definitions of a nod, a blink and a smile of a face, for the report, callbacks and evaluation.
 MOTION_EVENTS: Final[Mapping[str, EventKind]] = {
     "nod": EventKind(lambda motion: motion[..., CHANNEL_INDEX["pitch"]], find_nods, whole=True),
     "blink": EventKind(lambda motion: motion[..., BLINKS].max(axis=-1), find_blinks, whole=True),
-    "smile": EventKind(lambda motion: motion[..., _CORNERS].mean(axis=-1), find_smiles, whole=False),
+    "smile": EventKind(lambda motion: motion[..., CORNERS].mean(axis=-1), find_smiles, whole=False),
 }
 
 
@@ -154,22 +154,19 @@ def band_pass(values: Doubles, low_hz: float, high_hz: float, rate_hz: float) ->
     """
     start, end = 2 * values[0] - values[_EDGE:0:-1], 2 * values[-1] - values[-2 : -_EDGE - 2 : -1]
     mirrored = np.concatenate([start, values, end])
-    for _ in range(2):
-        mirrored = _once(mirrored, low_hz, high_hz, rate_hz)[::-1]
-    return mirrored[_EDGE:-_EDGE]
-
-
-def _once(values: Doubles, low_hz: float, high_hz: float, rate_hz: float) -> Doubles:
-    """Filter once, causally, by the spectrum; padded until the filter has settled, so that nothing wraps around."""
+    # Each pass is causal, by the spectrum; padded until the filter has settled, so that nothing wraps around.
     low, high = (np.tan(np.pi * edge_hz / rate_hz) for edge_hz in (low_hz, high_hz))  # prewarped for the bilinear map
     settled = int(-np.log(_SETTLED) / min(low, high - low)) + 1
-    size = 1 << int(len(values) + settled - 1).bit_length()
+    size = 1 << int(len(mirrored) + settled - 1).bit_length()
     s = 1j * np.tan(np.pi * np.arange(size // 2 + 1) / size)  # on the unit circle; infinite at half the rate
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         p = (s * s + low * high) / ((high - low) * s)  # low-pass prototype -> band-pass
         response = 1.0 / (p * p + np.sqrt(2) * p + 1.0)
     response[[0, -1]] = 0.0
-    return np.fft.irfft(np.fft.rfft(values - values[0], size) * response, size)[: len(values)]
+    for _ in range(2):
+        passed = np.fft.irfft(np.fft.rfft(mirrored - mirrored[0], size) * response, size)
+        mirrored = passed[: len(mirrored)][::-1]
+    return mirrored[_EDGE:-_EDGE]
 
 
 def _maxima(values: Doubles) -> Indices:

@@ -35,7 +35,6 @@ from sfms_robot.listeners.events.evidence import (
     AT,
     BACK,
     BEAM,
-    CORNERS,
     COUNTED_S,
     DONE,
     EPS_S,
@@ -78,6 +77,7 @@ from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals import phase
 from sfms_robot.signals.audio import energies_db
 from sfms_robot.signals.event_sizes import SWING_S
+from sfms_robot.signals.events import CORNERS
 
 _TOGETHER: Final = 1000  # steps: as much as stays in a cache
 _MOST_NODS: Final = 1 + COUNTED_S / SWING_S[0]  # in the time in which they are counted
@@ -208,11 +208,10 @@ def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
 def signs_in(faces: Sequence[FaceFrame | None]) -> Doubles:
     """Return nods, sizes of smiles, laughs, moving mouth (N, 4) of a recording: `read_signs` of all frames at once."""
     channels = np.full((len(faces), 4), np.nan)
-    known = [index for index, face in enumerate(faces) if face is not None]
+    known = np.flatnonzero([face is not None for face in faces])
     motion = np.array([face.motion for face in faces if face is not None], np.float64).reshape(-1, MOTION_DIM)
     finite = np.isfinite(motion).all(axis=1)
-    if len(known):
-        channels[np.array(known)[finite]] = motion[finite][:, [PITCH, *CORNERS, JAW]]
+    channels[known[finite]] = motion[finite][:, [PITCH, *CORNERS, JAW]]
     pitch_rad, found = np.full(len(faces), np.nan), np.zeros((len(faces), 4))
     smoothed, neutral, held, jaw, opening = None, None, 0, 0.0, 0.0
     for index, (pitch, left, right, open_) in enumerate(channels.tolist()):

@@ -28,7 +28,6 @@ import numpy as np
 from sfms_robot.frames import (
     CHANNEL_INDEX,
     FRAME_S,
-    SMILE_CORNERS,
     Doubles,
     Events,
     FaceFrame,
@@ -39,6 +38,7 @@ from sfms_robot.frames import (
 )
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.audio import energy_db
+from sfms_robot.signals.events import CORNERS
 from sfms_robot.signals.phase import SpeechPhase
 from sfms_robot.signals.voice_activity import Ear
 
@@ -234,7 +234,6 @@ _NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: a person who al
 _NEUTRAL_FALL: Final = 0.1
 _MOTION: Final = 0.12
 SWAY: Final = FRAME_S / 8.0  # of the mean swing: some eight seconds
-CORNERS: Final = [CHANNEL_INDEX[name] for name in SMILE_CORNERS]
 JAW: Final = CHANNEL_INDEX["jawOpen"]
 PITCH: Final = CHANNEL_INDEX["pitch"]
 
@@ -417,7 +416,7 @@ def looks_at_head(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, Se
     if given is None or not math.isfinite(given):
         return math.nan, changed(memory, unseen=0, attention=None, looked=math.nan)
     before = 1.0 if memory.attention is None else memory.attention
-    given = min(max(given, 0.0), 1.0)
+    given = _within(given)
     level = given + (before - given) * _KEPT
     looked = 1.0 if math.isnan(memory.looked) else memory.looked
     if level > LOOKED:

@@ -1,7 +1,5 @@
 """Whole recordings at once say what frame by frame says."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from sfms_robot.config import Calmness
 from sfms_robot.frames import CHANNEL_INDEX, EVENT_KINDS, FRAME_S, FRAME_SAMPLES, FaceFrame, ListenerEvent, SpeakerFrame
 from sfms_robot.lab.evaluation.whole_recordings import hazards_in, heard_in, most_in, scene_in, steps_in
 from sfms_robot.listeners.events.evidence import EPS_S, HEARD, Sensed, sense
-from sfms_robot.listeners.events.model import EventModel
+from sfms_robot.listeners.events.model import EventModel, changed
 
 FRAMES = 4000
 CALMNESS = [Calmness(), Calmness(nod=6.0, blink=0, addressed="assume")]
@@ -84,14 +82,13 @@ def test_hazards_are_those_asked_frame_by_frame(rows, history, calmness):
     memory = model.start(0, calmness)
     for index, one in enumerate(rows):
         begun = tuple(event for event in history if event.start_s < (index + 1) * FRAME_S - EPS_S)
-        ((_, memory),) = model.decide_each([one], [replace(memory, done=begun)])
+        ((_, memory),) = model.decide_each([one], [changed(memory, done=begun)])
         for kind, hazard_hz in memory.hazards_hz.items():
             assert found[kind][index] == pytest.approx(hazard_hz, abs=1e-9), (kind, index)
 
 
 def test_no_history_makes_anything_likelier_than_the_most(rows, history):
-    model, heard = EventModel.load(), np.stack([one.heard for one in rows])
-    steps = steps_in(FRAMES)
+    model, heard, steps = EventModel.load(), np.stack([one.heard for one in rows]), steps_in(FRAMES)
     for calmness in CALMNESS:
         most = most_in(model, heard[steps], calmness)
         for own in (history, [event for event in history if event.kind == "nod"], []):
