@@ -24,8 +24,9 @@ _POSE_NAME: Final = re.compile(
 )
 _SEPARATORS: Final = re.compile(r"[\s_-]+")
 _SHAPE_OF: Final[Mapping[str, str]] = {
-    **{name.lower(): name for name in BLENDSHAPES},
-    **{name.lower().removesuffix("eft").removesuffix("ight"): name for name in BLENDSHAPES},  # ..._L, ..._R
+    spelt: name
+    for name in BLENDSHAPES
+    for spelt in (name.lower(), name.lower().removesuffix("eft").removesuffix("ight"))  # ..._L, ..._R
 }
 _MOST_NAMED: Final = 8
 
@@ -119,7 +120,7 @@ def units_of(motion: Floats | Doubles, times_s: Doubles) -> FaceUnits:
 
 
 @lru_cache(maxsize=8)
-def face_bounds(turn_rad: float = _MOST_TURN_RAD) -> tuple[Doubles, Doubles]:
+def face_bounds(turn_rad: float) -> tuple[Doubles, Doubles]:
     """Return the least and the most (58,) of a face in our units, not to be changed; `turn_rad`: the largest angle."""
     low, high = _SHAPE_RANGE
     least, most = (-turn_rad, -_MOST_MOVED_M, low), (turn_rad, _MOST_MOVED_M, high)

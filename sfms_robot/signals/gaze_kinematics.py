@@ -214,10 +214,9 @@ def _towards(axis: Axis, goal: float, left_s: float) -> Axis:
 
 # --- Eye channels as angles and back: (yaw, pitch), yaw + to the head's left, pitch + down ----------------------------
 
-_LEFT = tuple(CHANNEL_INDEX[f"eyeLook{way}Left"] for way in ("Out", "In", "Down", "Up"))
-_RIGHT = tuple(CHANNEL_INDEX[f"eyeLook{way}Right"] for way in ("In", "Out", "Down", "Up"))
-_PLUS = np.array([_LEFT[0], _LEFT[2], _RIGHT[0], _RIGHT[2]])
-_MINUS = np.array([_LEFT[1], _LEFT[3], _RIGHT[1], _RIGHT[3]])
+# Yaw and pitch of the left eye, then of the right one.
+_PLUS = np.array([CHANNEL_INDEX[f"eyeLook{way}"] for way in ("OutLeft", "DownLeft", "InRight", "DownRight")])
+_MINUS = np.array([CHANNEL_INDEX[f"eyeLook{way}"] for way in ("InLeft", "UpLeft", "OutRight", "UpRight")])
 
 
 def directions(motion: Floats, full_rad: Doubles) -> Doubles:

@@ -36,8 +36,7 @@ def mfcc78(samples: Floats) -> Floats:
     cut = np.lib.stride_tricks.sliding_window_view(chunks, WINDOW, axis=1)[:, ::HOP]  # snipped edges
     static = np.moveaxis(cepstra(cut), 1, 2)[..., :2]  # (frames, 13, 2)
     delta = deltas(static)
-    stacked = np.stack([static, delta, deltas(delta)], axis=1)
-    return np.asarray(stacked.reshape(frames, DIM), dtype=np.float32)
+    return np.asarray(np.stack([static, delta, deltas(delta)], axis=1).reshape(frames, DIM), dtype=np.float32)
 
 
 def cepstra(windows: Reals) -> Doubles:
@@ -68,8 +67,7 @@ def deltas(values: Doubles) -> Doubles:
 def _filters() -> Doubles:
     """Return (23, 256) triangles equally spaced in mel from 20 Hz up; the bin at half the rate takes no part."""
     edges = np.linspace(_mel(LOW_HZ), _mel(AUDIO_HZ / 2), MEL_BINS + 2)
-    bins = _mel(np.arange(FFT // 2) * AUDIO_HZ / FFT)
-    return triangles(edges, bins)
+    return triangles(edges, _mel(np.arange(FFT // 2) * AUDIO_HZ / FFT))
 
 
 def _mel(hz: Doubles | float) -> Doubles:

