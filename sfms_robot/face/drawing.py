@@ -45,13 +45,7 @@ def load_vtk() -> Any:
     with optional("a picture of the head"):
         import vtkmodules.vtkRenderingFreeType
         import vtkmodules.vtkRenderingOpenGL2  # noqa: F401
-        from vtkmodules import (
-            vtkCommonCore,
-            vtkCommonDataModel,
-            vtkFiltersCore,
-            vtkIOImage,
-            vtkRenderingCore,
-        )
+        from vtkmodules import vtkCommonCore, vtkCommonDataModel, vtkFiltersCore, vtkIOImage, vtkRenderingCore
         from vtkmodules.util import numpy_support
     vtkCommonCore.vtkLogger.SetStderrVerbosity(vtkCommonCore.vtkLogger.VERBOSITY_ERROR)  # not of a missing display
     names: dict[str, Any] = {"arrays": numpy_support}

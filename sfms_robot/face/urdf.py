@@ -104,8 +104,7 @@ class Urdf:
         """Return every link's place (4, 4) in the root's axes, for joint values [rad, m]; 0 where none is given."""
         places = {self.root: np.eye(4)}
         for joint in self.joints.values():
-            value = self._value(joint, values)
-            places[joint.child] = places[joint.parent] @ joint.place @ joint.motion(value)
+            places[joint.child] = places[joint.parent] @ joint.place @ joint.motion(self._value(joint, values))
         return places
 
     def _value(self, joint: JointElement, values: Mapping[str, float]) -> float:

@@ -59,8 +59,7 @@ class CommandAudit:
         first = stream[1:] - stream[:-1]
         second = first[1:] - first[:-1]
         differences = np.stack([first[-1], second[-1], second[-1] - second[-2]])
-        last = state.recent_rad[-1]
-        bad = ~finite | ~self._own.reaching(last).holds(angles)
+        bad = ~finite | ~self._own.reaching(state.recent_rad[-1]).holds(angles)
         bad |= np.logical_or.reduce(np.abs(differences) > self._bounds, axis=0)
 
         ticks = self._calibration.to_ticks(angles)

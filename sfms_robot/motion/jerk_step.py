@@ -147,18 +147,18 @@ class TimeOptimalChase:
         return after if lawful(after) else None
 
 
-class StopChase:
+class StopChase(NamedTuple):
     """Chase by the most jerk toward the target that still lets the joint stop where the target would stop.
 
     A state reached in one tick by a mixture of braking and full jerk is the same mixture of the two states, and the
     more jerk, the farther on its stop ends: so the mixture is found by halving.
     """
 
-    def __init__(self, bounds: Sequence[Bound], dt_s: float) -> None:
-        self._bounds, self._dt_s = bounds, dt_s
+    bounds: Sequence[Bound]
+    dt_s: float
 
     def step(self, joint: int, before: State, target: State, lawful: Lawful) -> State | None:
-        bound, dt = self._bounds[joint], self._dt_s
+        bound, dt = self.bounds[joint], self.dt_s
         way = _stops_at(target, bound) - _stops_at(before, bound)
         if way == 0:
             return None
@@ -180,10 +180,10 @@ class StopChase:
     def _ends(self, before: State, bound: Bound, s: float) -> tuple[State, State]:
         """Return one tick of braking, and one of full jerk along `s` within the limit of acceleration."""
         position, speed, acceleration = before
-        way, *rates = Stop.of(speed, acceleration, bound).after(self._dt_s)
-        rising = min(max((bound.acceleration - s * acceleration) / bound.jerk, 0.0), self._dt_s)
+        way, *rates = Stop.of(speed, acceleration, bound).after(self.dt_s)
+        rising = min(max((bound.acceleration - s * acceleration) / bound.jerk, 0.0), self.dt_s)
         rising_to = _moved((position, speed, acceleration), s * bound.jerk, rising)
-        return (position + way, *rates), _moved(rising_to, 0.0, self._dt_s - rising)
+        return (position + way, *rates), _moved(rising_to, 0.0, self.dt_s - rising)
 
 
 def _stops_at(state: State, bound: Bound) -> float:

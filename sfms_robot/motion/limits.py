@@ -275,7 +275,7 @@ class JerkLimiter:
 
     def _lawful(self, j: int, state: State, low: float, high: float) -> bool:
         """Return whether joint j may go to `state`, the range in force being low..high."""
-        first, last, bound = self._ends[j][0], self._ends[j][1], self._bounds[j]
+        (first, last), bound = self._ends[j], self._bounds[j]
         if low == first and high == last:  # inside its own range
             return lawful(state, low, high, bound)
         if not low <= state[0] <= high:
