@@ -56,6 +56,8 @@ _SHAPE_QUANTILE: Final = 0.2
 _HIGHEST_REST: Final = 0.5  # a shape held above this is an expression, however long it lasts
 _MEDIANS: Final = [i for i, name in enumerate(CHANNELS) if name not in BLENDSHAPES or name.startswith("eyeLook")]
 
+AS_SENT: Final[Floats] = np.ones(len(POSE_CHANNELS), np.float32)  # signs of the pose channels
+
 PACKETS_PER_CALL: Final = 64
 LONGEST_CALL_S: Final = 0.002
 LONGEST_PACKET: Final = 16_384  # bytes; a longer one is cut off and counts as malformed
@@ -106,7 +108,7 @@ def split_options(flag: str, argument: str, *known: str) -> tuple[str, list[tupl
 
 def pose_signs(kind: str, options: Iterable[tuple[str, str]]) -> Floats:
     """Return the sign of each pose channel, by the options `flip` of `--face KIND`. Raises ConfigError."""
-    signs = np.ones(len(POSE_CHANNELS), dtype=np.float32)
+    signs = AS_SENT.copy()
     for channel in [each for name, value in options if name == "flip" for each in value.split("+")]:
         if channel not in POSE_CHANNELS:
             raise ConfigError(
@@ -122,12 +124,12 @@ class LiveFace(SourcePart):
     Several faces between two questions become one, the newest, with the strongest blink of all: none falls between
     frames. All methods may be called from any thread.
 
-    signs: (6,) factors of the pose channels; None: 1.
+    signs: (6,) factors of the pose channels.
     """
 
-    def __init__(self, signs: Floats | None = None, now: Clock = time.monotonic) -> None:
+    def __init__(self, signs: Floats = AS_SENT, now: Clock = time.monotonic) -> None:
         super().__init__(now)
-        self._signs: Floats = np.ones(len(POSE_CHANNELS), dtype=np.float32) if signs is None else signs
+        self._signs = signs
         self._rest = RestingFace()
         self._waiting: deque[tuple[float, Floats, Floats | None]] = deque(maxlen=_WAITING)
         self._sighting: Sighting | None = None

@@ -41,7 +41,7 @@ _VALUES: Final = (*_SHAPES, "yaw", "pitch", "roll", *(f"eye{i}" for i in range(6
 _NEEDED: Final = _VALUES.index("eye0")
 # Of each of our channels: where it stands in a packet, and its factor; a packet has no position.
 _COLUMNS: Final = np.array([_VALUES.index(name) if name in _VALUES else 0 for name in CHANNELS])
-_FACTORS: Final = np.array([1, 1, 1, 0, 0, 0, *[1] * 52], dtype=np.float32)
+_FACTORS: Final = np.array([name in _VALUES for name in CHANNELS], dtype=np.float32)
 
 
 class LiveLinkPacket(NamedTuple):

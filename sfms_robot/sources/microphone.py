@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.data import Report
-from sfms_robot.errors import NOTE
+from sfms_robot.errors import NOTE, Said
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_S, FRAME_SAMPLES, SILENCE, Floats
 from sfms_robot.ports import Facts, Voice
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES
@@ -148,9 +148,8 @@ def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker
 class SpeechFrames:
     """Speech of the robot, in frames of the loop, known one frame before they are played."""
 
-    def __init__(self) -> None:
-        self._first = 0  # sample of the loop
-        self._samples: Floats = SILENCE[:0]
+    _first = 0  # sample of the loop
+    _samples: Floats = SILENCE[:0]
 
     def start(self, origin_s: float) -> None:
         """Do nothing: they are counted from the origin already."""
@@ -266,7 +265,7 @@ class Microphone:
         self.latency_s = 0.0
         self._late_frames = 0
         self._figures: Facts = {}
-        self._logged: set[str] = set()
+        self._logged = Said()
         self._said: dict[int, Floats | None] = {}
         self._speed_rad_s = self._sent_speed_rad_s = 0.0
         self._collect(0.0, 0)
@@ -337,8 +336,7 @@ class Microphone:
                 self.device = message
             else:
                 for about, line in message.pop(LINES, {}).items():
-                    if line and about not in self._logged:
-                        self._logged.add(about)
+                    if line and self._logged.first(about):
                         logger.warning("%s (said once)", line)
                 self._figures = message
 
@@ -364,13 +362,11 @@ class Loudspeaker:
 
     def __init__(self, recorder: Microphone, beside: bool) -> None:
         self._recorder, self._beside = recorder, beside
+        self.start, self.close = recorder.start, recorder.close
 
     @property
     def lost(self) -> bool:
         return self._recorder.lost
-
-    def start(self, origin_s: float) -> None:
-        self._recorder.start(origin_s)
 
     def take(self, index: int) -> Floats | None:
         """Return what was recorded one frame before, with the microphone's; two before, without a microphone."""
@@ -380,9 +376,6 @@ class Loudspeaker:
         figures = self._recorder.statistics()
         return figures.get("reference", {}) if self._beside else figures
 
-    def close(self) -> None:
-        self._recorder.close()
-
 
 def open_microphone(argument: str, agent: Voice | None = None) -> Microphone:
     """Open `--audio mic[:DEVICE]`: a number, a name or a part of one; "" is the default.
@@ -391,14 +384,12 @@ def open_microphone(argument: str, agent: Voice | None = None) -> Microphone:
     Blocks until it records, a second. Raises ConfigError for a device that is not there and without PortAudio,
     PortError where there is no microphone or it cannot be opened.
     """
-    early_s = None if agent is None else getattr(agent, "early_s", 0.0)
-    return _opened(argument, MIC_FLAG, early_s=early_s)
+    return _opened(argument, MIC_FLAG, early_s=None if agent is None else getattr(agent, "early_s", 0.0))
 
 
 def open_microphone_and_loudspeaker(argument: str, device: str) -> tuple[Microphone, Loudspeaker]:
     """Open as `open_microphone`, without what `device` records of the robot's voice; return also that voice."""
-    reference = device_name(device, DEVICE_FLAG)
-    microphone = _opened(argument, MIC_FLAG, reference)
+    microphone = _opened(argument, MIC_FLAG, device_name(device, DEVICE_FLAG))
     return microphone, Loudspeaker(microphone, beside=True)
 
 

@@ -167,6 +167,7 @@ def json_message(**values: Any) -> bytes:
     return json.dumps(values, allow_nan=False).encode()
 
 
+@dataclass
 class SenderClock:
     """The clock of a program that sends, in ours.
 
@@ -175,10 +176,9 @@ class SenderClock:
     way, and never early; a clock that drifts is followed. Holds the least `arrived - sent` of two windows.
     """
 
-    def __init__(self) -> None:
-        self._began_s = 0.0
-        self._now_least: float | None = None
-        self._last_least: float | None = None
+    _began_s: float = 0.0
+    _now_least: float | None = None
+    _last_least: float | None = None
 
     def observe(self, sent_s: float, arrived_s: float) -> None:
         """Take in a message that arrived at `arrived_s` of `time.monotonic`."""

@@ -156,12 +156,27 @@ class NetPerson(NetServer):
     def hears(self, audio: Floats, time_s: float) -> None:
         """Send what the run hears, (640,), whose newest sample is of loop time `time_s`. Never blocks."""
         at_s = self._origin_s + time_s
-        self.post(lambda: self._send_sound(audio, at_s))
+
+        def send() -> None:
+            if wanting := self._wanting("microphone"):
+                samples = np.rint(np.clip(audio, -1.0, 1.0) * 32767).astype(np.int16)
+                message = sound_message(MICROPHONE, AUDIO_HZ, self.now(), at_s, samples)
+                for connection in wanting:
+                    connection.send(message)
+
+        self.post(send)
 
     def tells(self, kind: str, time_s: float, **values: Any) -> None:
         """Send an event, or a state, that begins at loop time `time_s`. Never blocks."""
         event = {"type": kind, "at_s": round(self._origin_s + time_s, 4), **values}
-        self.post(lambda: self._send_event(event))
+
+        def send() -> None:
+            if kind == "state":
+                self._state = event
+            for connection in self._wanting("events"):
+                connection.send(json_message(**event, sent_s=round(self.now(), 4)))
+
+        self.post(send)
 
     def statistics(self) -> Facts:
         """Return the server's counts, sound and faces that were too late or too fast, and which program feeds what."""
@@ -235,19 +250,6 @@ class NetPerson(NetServer):
 
     def _wanting(self, what: str) -> list[NetProgram]:
         return [each for each in self.connections if what in each.wants]
-
-    def _send_sound(self, audio: Floats, at_s: float) -> None:
-        if wanting := self._wanting("microphone"):
-            samples = np.rint(np.clip(audio, -1.0, 1.0) * 32767).astype(np.int16)
-            message = sound_message(MICROPHONE, AUDIO_HZ, self.now(), at_s, samples)
-            for connection in wanting:
-                connection.send(message)
-
-    def _send_event(self, event: Facts) -> None:
-        if event["type"] == "state":
-            self._state = event
-        for connection in self._wanting("events"):
-            connection.send(json_message(**event, sent_s=round(self.now(), 4)))
 
 
 class _NetPart(SourcePart):

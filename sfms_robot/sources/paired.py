@@ -187,13 +187,11 @@ class JudgedSource:
         self.latency_s = inner.latency_s
         self.missing: Names = ()
         self._inner = inner
+        self.start, self.moves, self.close = inner.start, inner.moves, inner.close
         self.outlets: Sequence[Outlet] = tuple(getattr(inner, "outlets", ()))
         self._judge = FrameJudge()
         self._pace = Pace()
         self._given = 0
-
-    def start(self, origin_s: float) -> None:
-        self._inner.start(origin_s)
 
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
         """Return the frames of the inner source; raises what it raises."""
@@ -210,12 +208,6 @@ class JudgedSource:
     def statistics(self) -> Facts:
         """Return frames so far, what was left out of them, and the inner source's own statistics."""
         return {"frames": self._given, "left_out": dict(self._judge.left_out), **self._inner.statistics()}
-
-    def moves(self, speed_rad_s: float) -> None:
-        self._inner.moves(speed_rad_s)
-
-    def close(self) -> None:
-        self._inner.close()
 
 
 _SOURCE: Final = ("duration_s", "latency_s", "missing", "start", "read", "moves", "statistics", "close")

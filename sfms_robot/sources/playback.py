@@ -214,8 +214,7 @@ class Playout:
 
     def statistics(self) -> Facts:
         """Return how often the device ran dry, jumps, and the drift of the card."""
-        drift_ppm = None if self._clock is None else round(self._clock.drift_ppm, 1)
-        return {**self._counts, "drift_ppm": drift_ppm}
+        return {**self._counts, "drift_ppm": None if self._clock is None else round(self._clock.drift_ppm, 1)}
 
     def _followed(self, leaves_s: float, dry: bool) -> SampleClock:
         """Return the clock, which has seen this block; a new one where the block does not follow the last one."""
@@ -402,8 +401,7 @@ def open_playback(argument: str, spoken: Spoken) -> PlayedVoice:
     Blocks until it plays, a second. Raises ConfigError for a device that is not there and without PortAudio, PortError
     where there is no loudspeaker or it cannot be opened.
     """
-    wanted = "" if argument == DEFAULT else argument
-    worker = SourceWorker("loudspeaker", play, device_name(wanted, FLAG, plays=True))
+    worker = SourceWorker("loudspeaker", play, device_name("" if argument == DEFAULT else argument, FLAG, plays=True))
     worker.wait()
     played = PlayedVoice(worker, spoken)
     spoken.played_by(played)

@@ -314,7 +314,7 @@ class Webcam(LiveFace):
         latency_s: median from a picture taken to its face known; 0 before the first picture.
     """
 
-    def __init__(self, worker: SourceWorker, signs: Floats | None, duration_s: float | None) -> None:
+    def __init__(self, worker: SourceWorker, signs: Floats, duration_s: float | None) -> None:
         super().__init__(signs)
         self._worker, self.duration_s = worker, duration_s
         self._started = False
@@ -337,11 +337,7 @@ class Webcam(LiveFace):
 
     def statistics(self) -> Facts:
         """Return the state of the worker; counts of pictures, without a face, dark, with other people; latency."""
-        return {
-            **self._worker.statistics(),
-            **self._counts,
-            "latency_ms": self._latency_ms.report(p50=50, p99=99),
-        }
+        return {**self._worker.statistics(), **self._counts, "latency_ms": self._latency_ms.report(p50=50, p99=99)}
 
     def close(self) -> None:
         self._worker.close()

@@ -13,8 +13,7 @@ started again after a pause that grows (`processes.LIMITS["source"]`).
     parent -> child    (work, argument, nice), then messages
     child -> parent    None, or (kind, value)
         value          it yielded `value`
-        failed         it raised, and value is the RobotError that says why
-        broke          something else was raised, and value names it
+        failed         it raised, and value is the RobotError that says why, or the name of another error
         finished       it returned
 """
 
@@ -123,7 +122,7 @@ def _failure(message: Any) -> RobotError | str | None:
     """Return what a message says went wrong; None if nothing did."""
     if isinstance(message, Ended):
         return f"its process died (exit code {message.code})"
-    return message[1] if message[0] in ("failed", "broke") else None
+    return message[1] if message[0] == "failed" else None
 
 
 # --- Child ------------------------------------------------------------------------------------------------------------
@@ -147,4 +146,4 @@ def main() -> None:
     except RobotError as error:
         parent.send(("failed", error))
     except Exception as error:  # of a library or a driver: reported by the parent, which starts the work again
-        parent.send(("broke", f"{type(error).__name__}: {error}"))
+        parent.send(("failed", f"{type(error).__name__}: {error}"))

@@ -41,7 +41,7 @@ def camera():
         opened.append(worker)
         for _ in messages:
             worker.wait()
-        return camera_source.Webcam(worker, None, None)
+        return camera_source.Webcam(worker, np.ones(6, np.float32), None)
 
     yield of
     for worker in opened:
