@@ -150,7 +150,7 @@ def write_track(path: Path | str, track: Track) -> None:
     Path(path).write_bytes(gzip.compress(data, mtime=0) if str(path).endswith(".gz") else data)
 
 
-def resample(track: Track, rate_hz: float = FRAME_HZ, start_s: float = 0.0) -> Track:
+def resample(track: Track, rate_hz: float, start_s: float = 0.0) -> Track:
     """Return the track at start_s, start_s + 1/rate_hz, ... up to its last row.
 
     Linear in time; a blink takes its maximum over the interval that ends at the instant, so that none falls between

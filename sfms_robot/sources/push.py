@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import ClassVar, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +66,7 @@ class PushedVoice(LiveVoice):
         pace: at which it comes. What is wrong with it is logged once.
     """
 
-    _way: ClassVar[str] = "hear()"  # in logs
+    _way = "hear()"  # in logs
 
     def __init__(self, now: Clock = time.monotonic) -> None:
         super().__init__(now)
@@ -116,7 +116,7 @@ class PushedSight(SourcePart):
 
     def __init__(self, now: Clock = time.monotonic) -> None:
         super().__init__(now)
-        self._seen: deque[tuple[float, Sighting | None]] = deque(maxlen=SIGHTINGS)  # seconds of `now`
+        self._seen = deque[tuple[float, Sighting | None]](maxlen=SIGHTINGS)  # seconds of `now`
 
     def see(
         self,
@@ -160,9 +160,8 @@ class PushedSpeech(SourcePart):
     silence after that. All methods may be called from any thread; `take` waits for none of them.
     """
 
-    def __init__(self, now: Clock = time.monotonic, longest_s: float = SAID_S) -> None:
+    def __init__(self, now: Clock = time.monotonic) -> None:
         super().__init__(now)
-        self._longest = int(longest_s * AUDIO_HZ)
         self._saying = threading.Lock()  # of `say` and `hush`: the stretch that is resampled
         self._rate_hz = float(AUDIO_HZ)
         self._mix = Downmix()
@@ -171,7 +170,7 @@ class PushedSpeech(SourcePart):
         self._began = 0  # samples of 16 kHz since 0 of `now`, as all places
         self._place = 0  # of the next sample that comes out of the resampler
         # To be played; the lock is held for no longer than a list takes.
-        self._pieces: deque[tuple[int, Floats]] = deque()
+        self._pieces = deque[tuple[int, Floats]]()
         self._origin = 0
         self._taken = 0  # up to here it has been asked for
         self._speaks = False
@@ -287,7 +286,7 @@ class PushedSpeech(SourcePart):
                     self._pieces.append((place, piece[: at - place]))
 
     def _append(self, samples: Floats) -> None:
-        kept = samples[: max(0, _place(self._now()) + self._longest - self._place)]
+        kept = samples[: max(0, _place(self._now() + SAID_S) - self._place)]
         with self._lock:
             self._speaks = True
             self._counts["dropped"] += len(samples) - len(kept)

@@ -76,7 +76,7 @@ class RecordedSight(SourcePart):
         frames: of the voice it belongs to, with which it starts again; None: it is on its own.
     """
 
-    def __init__(self, track: Track, loop: bool = False, frames: int | None = None) -> None:
+    def __init__(self, track: Track, loop: bool, frames: int | None) -> None:
         super().__init__()
         self._faces = resample(track, FRAME_HZ, start_s=FRAME_S).motion
         self._loop = loop

@@ -259,8 +259,9 @@ def test_a_voice_that_is_streamed_as_it_is_played_has_no_gaps(lates_s, rate_hz):
     assert first <= 640 + 240 and (sound[first + 32 :] > 0.1).all()
 
 
-def test_speech_too_far_ahead_and_speech_after_its_time_are_left_out_and_counted():
-    speech = PushedSpeech(lambda: 0.0, longest_s=0.08)
+def test_speech_too_far_ahead_and_speech_after_its_time_are_left_out_and_counted(monkeypatch):
+    monkeypatch.setattr("sfms_robot.sources.push.SAID_S", 0.08)
+    speech = PushedSpeech(lambda: 0.0)
     speech.say(np.r_[np.full(640, 0.1), np.full(1280, 0.2)], 16000)
     out = played(speech, 5)
     assert (out[640:1280] == np.float32(0.1)).all() and not out[1280:].any()
