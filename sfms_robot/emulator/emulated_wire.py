@@ -105,13 +105,13 @@ class EmulatedWire:
         self._devices = devices
         self._on_the_wire = timing == "wire"
         self.faults = WireFaults(seed)
-        self._inbox: deque[tuple[float, bytes, int | None]] = deque()  # (arrives at, data, baud), in that order
+        self._inbox = deque[tuple[float, bytes, int | None]]()  # (arrives at, data, baud), in that order
         self._outbox: list[Out] = []
         self._number = 0
         self._free_s = 0.0  # until then the line is busy
         self._before_brownout: dict[int, float] = {}
         self._seen = hashlib.sha256()
-        self._stamps: deque[tuple[tuple[int, ...], float, float]] = deque(maxlen=_STAMPS)
+        self._stamps = deque[tuple[tuple[int, ...], float, float]](maxlen=_STAMPS)
         self._counts = {"bytes_in": 0, "bytes_out": 0, "replies": 0, "emulator_late": 0}
         self._busy_s = 0.0
         for fault in faults:

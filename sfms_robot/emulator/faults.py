@@ -39,7 +39,7 @@ _OF_REPLIES: Final = Kind("fraction of replies")
 _OF_REQUESTS: Final = Kind("fraction of requests", ids=False)
 _STATE: Final = Kind("")
 TO_SERVOS: Final = "request-"  # kinds of faults between host and servos begin with this; the others hit replies
-KINDS: Final[dict[str, Kind]] = {
+KINDS: Final = {
     "drop": _OF_REPLIES,
     "delay": Kind("seconds", 0.02, 0.0, 60.0),
     "corrupt": _OF_REPLIES,

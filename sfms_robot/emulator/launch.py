@@ -240,7 +240,7 @@ def launch(
 
 def wait(chains: Sequence[Chain]) -> Chain:
     """Block until the process of a chain ends, and return that chain."""
-    ended: queue.SimpleQueue[Chain] = queue.SimpleQueue()
+    ended = queue.SimpleQueue[Chain]()
 
     def join(chain: Chain) -> None:
         chain.child.reader.join()

@@ -14,7 +14,6 @@ import json
 import lzma
 import struct
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +23,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.frames import POSE, SHAPES, Doubles, Floats, Ints
 from sfms_robot.signals.rotations import rotation
 
-FOLDER: Final[Path] = data_dir("sim") / "heads" / "human"
+FOLDER: Final = data_dir("sim") / "heads" / "human"
 _PIVOT_M: Final = np.array([-0.012, 0.0, -0.065])
 _UNDER_SKIN: Final = round(0.3 * 255)  # of `open_sky`: hair that comes out again where the neck is thin is left out
 

@@ -158,7 +158,7 @@ class CompositeBus:
 
         A bus that has a thread continues in a new one. Joints of a bus that has failed count as absent.
         """
-        held: dict[str, float] = dict.fromkeys(joints, 0.0)
+        held = dict.fromkeys(joints, 0.0)
         for name, bus in self._working():
             mine = [joint for joint in joints if joint in bus.joints]
             if mine and self._ended(name, time.monotonic() + STOP_S):

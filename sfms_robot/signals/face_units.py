@@ -161,7 +161,7 @@ class LiveUnits:
     def restart(self) -> None:
         """Begin again: another sender."""
         self.units = FaceUnits()
-        self._rows: deque[tuple[float, Floats]] = deque(maxlen=_WINDOW)
+        self._rows = deque[tuple[float, Floats]](maxlen=_WINDOW)
         self._began_s: float | None = None
 
     def take(self, motion: Floats, time_s: float) -> Floats | None:

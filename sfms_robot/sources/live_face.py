@@ -131,7 +131,7 @@ class LiveFace(SourcePart):
         super().__init__(now)
         self._signs = signs
         self._rest = RestingFace()
-        self._waiting: deque[tuple[float, Floats, Floats | None]] = deque(maxlen=_WAITING)
+        self._waiting = deque[tuple[float, Floats, Floats | None]](maxlen=_WAITING)
         self._sighting: Sighting | None = None
 
     def start(self, origin_s: float) -> None:

@@ -60,9 +60,9 @@ class SourcePart:
     now: `time.monotonic`, or a test's clock.
     """
 
-    lost: bool = False
+    lost = False
     duration_s: float | None = None
-    latency_s: float = 0.0
+    latency_s = 0.0
 
     def __init__(self, now: Clock = time.monotonic) -> None:
         self._now, self._lock, self._origin_s = now, threading.Lock(), 0.0
@@ -111,7 +111,7 @@ class SampleClock:
         self._nominal_hz = rate_hz
         self.skew = skew
         self._offset_s: float | None = None  # the line: offset + (1 + skew) x, with x = samples / nominal rate
-        self._least: deque[_Point] = deque(maxlen=BINS)  # (x, seconds - x)
+        self._least = deque[_Point](maxlen=BINS)  # (x, seconds - x)
         self._bin: _Point | None = None
         self._bin_ends_s = BIN_S
 
@@ -198,9 +198,9 @@ class Pace:
         self.rate: float | None = None
         self._last_s = -math.inf
         self._behind_s = self._most_s = 0.0
-        self._least: deque[_Point] = deque(maxlen=PACE_SECONDS + 1)  # (begin of a second, least), the last so far
+        self._least = deque[_Point](maxlen=PACE_SECONDS + 1)  # (begin of a second, least), the last so far
         self._wait_s = self._widest_s = 0.0  # longest since the last burst, and before any
-        self._bursts_s: deque[float] = deque(maxlen=BURSTS)
+        self._bursts_s = deque[float](maxlen=BURSTS)
         self._said = False
 
     def observe(self, piece_s: float, now_s: float) -> None:

@@ -258,7 +258,7 @@ class Microphone:
         self._worker = worker
         self.own_voice = None if early_s is None else self._take_own_voice
         self._early = round((early_s or 0.0) * AUDIO_HZ)
-        self._own: deque[Floats] = deque([SILENCE], maxlen=SAID_FRAMES)
+        self._own = deque[Floats]([SILENCE], maxlen=SAID_FRAMES)
         self._origin_s: float | None = None
         self._frames: dict[int, MicrophoneFrame] = {}
         self.device = ""

@@ -72,7 +72,7 @@ class NetServer(ServerThread):
         self.connections: set[NetProgram] = set()
         self._said = Said()
         super().__init__(flag, host, port, _STOP_S)
-        self._posted: deque[Callable[[], None]] = deque(maxlen=4 * OUTBOX)
+        self._posted = deque[Callable[[], None]](maxlen=4 * OUTBOX)
 
     def received(self, connection: NetProgram, message: Message) -> None:
         """Take a message, in the server's thread.
@@ -139,7 +139,7 @@ class NetProgram:
         self._loop = asyncio.get_running_loop()
         self._wire: TcpWire | WebSocketWire | None = None
         self._over = False
-        self._outbox: deque[bytes] = deque(maxlen=OUTBOX)
+        self._outbox = deque[bytes](maxlen=OUTBOX)
         self._waiting = asyncio.Event()  # something to send
 
     async def run(self) -> None:

@@ -182,7 +182,7 @@ class Playout:
         self._count = 0  # samples of the stretch that were handed over
         self._next = 0.0  # sample of the loop that is handed over next
         self._settled = False  # it continues where the last block ended
-        self.silences: deque[Silence] = deque(maxlen=_UNREPORTED)
+        self.silences = deque[Silence](maxlen=_UNREPORTED)
         self._counts = {"underruns": 0, "jumps": 0}
         at_positions(np.zeros(1, np.float32), np.zeros(1))  # makes its table now, not in the callback of the device
 

@@ -169,7 +169,7 @@ class Capture(DeviceStream):
     def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
         super().__init__(device, rate_hz, channels)
         self.overflows, self.pace = 0, Pace()
-        self._pieces: queue.SimpleQueue[tuple[Floats, float, bool]] = queue.SimpleQueue()
+        self._pieces = queue.SimpleQueue[tuple[Floats, float, bool]]()
 
     def pass_on(self, voice: LiveVoice, wait_s: float) -> None:
         """Push all that was recorded to `voice`; wait so long for something. Raises PortError when it went away."""

@@ -132,7 +132,7 @@ def main() -> None:
     """Do the work that the first message names until it ends, or the pipe does."""
     parent = ParentPipe()
     work, argument, nice = parent.receive()
-    newest: deque[Any] = deque([None], maxlen=1)
+    newest = deque[Any]([None], maxlen=1)
     parent.forward(newest.append)
     give_way(nice)
     try:

@@ -100,7 +100,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._poll = StatusPoll(name, self._members, self._telemetry, config, self._counts, self.link.framing)
         self._settings = Settings(self._members, self._telemetry.torque, self._poll)
         self._enabled = False
-        self._places: Indices = _NO_PLACES  # members that get goals
+        self._places = _NO_PLACES  # members that get goals
         self._rejoining: list[Member] = []  # members that wait for goals that begin where they stand
         self._arrived: set[int] = set()  # indices of members that came to hold a position in this poll
         self._stamp_s = 0.0
@@ -108,7 +108,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._released_ids = [servo.id for servo in servos if servo.safety.stop == "release"]
         self._release_packet = self._packet_off(self._released_ids)
         self._released = False  # by `torque_off`: no goal is sent until the next `enable`
-        self._asked: deque[tuple[int, bool]] = deque()  # released, or resumed (True); not yet passed to members
+        self._asked = deque[tuple[int, bool]]()  # released, or resumed (True); not yet passed to members
         self._sending = RLock()
         goal = self._telemetry.goal
         # Protocol 2.0 goals are encoded all at once; the others one by one, each checked against its sign rule.

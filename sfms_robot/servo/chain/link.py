@@ -78,7 +78,7 @@ class RegisterLink(ABC):
     """
 
     framing: ClassVar[Framing]
-    has_fast_read: ClassVar[bool] = False
+    has_fast_read = False
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         self.port = port

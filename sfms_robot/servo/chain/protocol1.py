@@ -41,7 +41,7 @@ class Protocol1Link(RegisterLink):
 
     family: ClassVar[str]
     who_length: ClassVar[int]  # bytes from address 0 on that hold model number and firmware
-    refusal_bits: ClassVar[int] = 0  # of the error byte, about the request
+    refusal_bits = 0  # of the error byte, about the request
     _packet: Callable[[int, int, bytes], bytes]  # returns a request: servo, instruction, parameters
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
