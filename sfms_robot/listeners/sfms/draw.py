@@ -131,7 +131,7 @@ def neutral_mask(frames: int, groups: int) -> Floats:
     return mask
 
 
-def passed(tokens: Tokens, path: Floats, frames: int = 1, holds: bool = False) -> tuple[Tokens, Floats]:
+def passed(tokens: Tokens, path: Floats, frames: int, holds: bool = False) -> tuple[Tokens, Floats]:
     """Return tokens (B, P + H, G) and path (B, 2 + H, C) of `frames` later.
 
     What passed undecided, before the first plan, was the neutral face: transitions. `holds`: the last keyframe that has
@@ -198,25 +198,20 @@ class CodeReach:
     """Frames needed from each token to each other one, per group. A row is computed when it is first asked for.
 
     Args:
+        settings: of the listener. Without `sampling.reach` every code may follow every other at once; a group still
+            never gets a code that it lacks.
         motion: (V, C) motion of every code, V of the largest group; the codes of a smaller one are its first.
-        channels: of each group.
-        codes: how many each group has.
         speed: (C,) fastest natural change of each channel from one frame to the next.
-        bounded: False lets every code follow every other at once; a group still never gets a code that it lacks.
     """
 
-    def __init__(
-        self,
-        motion: Floats,
-        channels: Sequence[Sequence[int]],
-        codes: Sequence[int],
-        speed: Floats,
-        bounded: bool = True,
-    ) -> None:
+    def __init__(self, settings: config.Sfms, motion: Floats, speed: Floats) -> None:
         self._classes = 1 + len(motion)
-        self._bounded = bounded
-        self._motion = [np.ascontiguousarray((motion[:size, own]).T) for own, size in zip(channels, codes, strict=True)]
-        self._speed = [np.maximum(speed[own, None], TINY) for own in channels]
+        self._bounded = settings.sampling.reach
+        self._motion, self._speed = [], []
+        for group in settings.groups.values():
+            own = [settings.channels.index(name) for name in group.channels]
+            self._motion.append(np.ascontiguousarray(motion[: group.codes, own].T))
+            self._speed.append(np.maximum(speed[own, None], TINY))
         self._rows: dict[tuple[int, int], NDArray[np.uint8]] = {}
 
     def too_soon(self, last: Tokens, gap: Tokens) -> Bools:
@@ -363,11 +358,11 @@ def _turned(control: Floats, told: Bools) -> tuple[Doubles, Doubles]:
 class Sampler:
     """Draws the tokens of one listener: frame by frame, every group at once, many streams at a time."""
 
-    def __init__(
-        self, settings: config.Sfms, engine: Engine, reach: CodeReach, courses: Sequence[EventCourse] = ()
-    ) -> None:
+    def __init__(self, settings: config.Sfms, engine: Engine, codes: Floats, courses: Sequence[EventCourse]) -> None:
+        """Take the motion (V, C) of every code, and the courses that it keeps to."""
         groups, common = list(settings.groups.values()), settings.sampling
-        self._engine, self._reach, self._courses = engine, reach, courses
+        self._engine, self._courses = engine, courses
+        self._reach = CodeReach(settings, codes, engine.tensors["motion_speed"])
         self._temperature, self._nucleus = np.float32(common.temperature), np.float32(common.nucleus)
         self._bias = np.array([group.transition_bias for group in groups], np.float32)
         self._classes = [group.codes + 1 for group in groups]

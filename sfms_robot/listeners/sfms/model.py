@@ -73,12 +73,7 @@ class Inpainter(nn.Module):
             nn.init.zeros_(self.out.bias)
 
     def forward(
-        self,
-        codes: Tensor,
-        mask: Tensor,
-        quantizer: Quantizer,
-        last: int | None = None,
-        around: Around | None = None,
+        self, codes: Tensor, mask: Tensor, quantizer: Quantizer, last: int | None = None, around: Around | None = None
     ) -> Tensor:
         """Return standardised motion (B, T, C) of codes (B, T, G, D), which count where mask (B, T, G) is 1.
 
@@ -126,7 +121,7 @@ class Tokenizer(nn.Module):
         super().__init__()
         groups = list(settings.groups.values())
         self.settings = settings
-        self.strategy: Strategy = settings.placement
+        self.strategy = settings.placement
         self.max_gap = settings.max_gap_frames
         self.window = settings.window_frames
         self.keyframes = [group.keyframes or 0 for group in groups]  # 0 where a keyframe has a cost instead
@@ -134,18 +129,14 @@ class Tokenizer(nn.Module):
         # Ours: groups of channels, each with its own mask and codebook; `preset: one` is the paper's single mask.
         member = [[float(name in group.channels) for name in settings.channels] for group in groups]
         self.member = nn.Buffer(torch.tensor(member), persistent=False)  # (G, C)
-        levels = [group.levels for group in groups]
-        self.quantizer = Quantizer(self.member, levels, settings.quantizer, settings.code_dims, settings.squashed)
+        self.quantizer = Quantizer(self.member, settings)
         self.inpainter = Inpainter(self.quantizer, settings)
         # Only learned placement has scores to learn; the others carry no dead weights.
-        scores = settings.scores
         self.score: ScoreNetwork | ConditionalScore | None = None
         if settings.placement in ("learned_paper", "adaptive"):
-            channels = len(settings.channels)
-            self.score = ScoreNetwork(channels, len(groups), scores.width, scores.heads, scores.layers)
+            self.score = ScoreNetwork(len(settings.channels), len(groups), settings.scores)
         elif settings.placement == "learned":
-            largest = max(len(group.channels) for group in groups)
-            self.score = ConditionalScore(largest, scores.width, scores.heads, scores.layers)
+            self.score = ConditionalScore(max(len(group.channels) for group in groups), settings.scores)
 
     def place(self, motion: Tensor, keyframes: Sequence[int] | None = None, strategy: Strategy | None = None) -> Tensor:
         """Return the mask (B, T, G) of motion (B, T, C).

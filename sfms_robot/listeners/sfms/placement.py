@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sfms_robot.config.listener import Placement
+from sfms_robot.config.listener import Placement, Scores
 from sfms_robot.listeners.layers import Block, places_of
 from sfms_robot.listeners.sfms.piecewise_linear import (
     Neighbours,
@@ -54,11 +54,12 @@ TIME_SCALE_FRAMES = 48.0
 class ScoreNetwork(nn.Module):
     """Phi_score: 1-D convolution, linear, sinusoidal positions, transformer encoder -> logits s of equation (4)."""
 
-    def __init__(self, inputs: int, outputs: int, width: int, heads: int, layers: int) -> None:
+    def __init__(self, inputs: int, outputs: int, settings: Scores) -> None:
         super().__init__()
+        width = settings.width
         self.conv = nn.Conv1d(inputs, width, kernel_size=5, padding=2)
         self.linear = nn.Linear(width, width)
-        self.blocks = nn.ModuleList(Block(width, heads) for _ in range(layers))
+        self.blocks = nn.ModuleList(Block(width, settings.heads) for _ in range(settings.layers))
         self.norm = nn.LayerNorm(width)
         self.out = nn.Linear(width, outputs)
 
@@ -115,10 +116,10 @@ def _principal(own: Tensor, most: int) -> Tensor:
 class ConditionalScore(nn.Module):
     """Logits of the next keyframe of a track, given those already chosen; one network for all groups."""
 
-    def __init__(self, largest_group: int, width: int, heads: int, layers: int) -> None:
+    def __init__(self, largest_group: int, settings: Scores) -> None:
         super().__init__()
         self.curves = min(MOST_CURVES, largest_group)
-        self.network = ScoreNetwork(3 * self.curves + STATE_FEATURES, 1, width, heads, layers)
+        self.network = ScoreNetwork(3 * self.curves + STATE_FEATURES, 1, settings)
 
     def forward(self, track: Tracks, chosen: Tensor, remaining: Tensor) -> Tensor:
         """Return logits (N, T), minus infinity where a frame is already `chosen` (N, T).
@@ -203,13 +204,11 @@ def place(
         return place_exact(motion, k, member, max_gap)
     if strategy in ("static", "static_paper"):
         return place_static(motion, k, centred=strategy == "static")
-    if strategy in ("learned_paper", "adaptive"):
-        if not isinstance(score, ScoreNetwork):
-            raise ValueError(f"{strategy} placement needs a score network of the paper's kind")
+    if isinstance(score, ScoreNetwork) and strategy in ("learned_paper", "adaptive"):
         return place_learned(score(motion), k)[0] if strategy == "learned_paper" else place_adaptive(score(motion))[0]
-    if not isinstance(score, ConditionalScore):
-        raise ValueError(f"{strategy} placement needs a conditional score network")
-    return place_conditional(motion, k, member, score, sweeps)
+    if isinstance(score, ConditionalScore) and strategy == "learned":
+        return place_conditional(motion, k, member, score, sweeps)
+    raise ValueError(f"{strategy} placement needs a score network of its kind")
 
 
 def place_static(motion: Tensor, k: Sequence[int], *, centred: bool = True) -> Tensor:
@@ -323,16 +322,13 @@ def _top_k(scores: Tensor, count: int) -> Tensor:
 
 
 @torch.no_grad()
-def place_conditional(
-    motion: Tensor, k: Sequence[int], member: Tensor, score: ConditionalScore, sweeps: int = 0
-) -> Tensor:
+def place_conditional(motion: Tensor, k: Sequence[int], member: Tensor, score: ConditionalScore, sweeps: int) -> Tensor:
     """Return the mask of the highest conditional scores, one keyframe after another, improved by rounds of `sweep`."""
     b, t, _ = motion.shape
     for count in k:
         _check(count, t)
     track = tracks(motion, member, score.curves)
-    counts = torch.tensor(k, device=motion.device).repeat(b)
-    mask = choose(score, track, counts)
+    mask = choose(score, track, torch.tensor(k, device=motion.device).repeat(b))
     for number in range(sweeps):
         mask = sweep(score, track, mask, together=1 + number % 2)
     return mask.view(b, len(k), t).transpose(1, 2).contiguous()
@@ -351,7 +347,7 @@ def choose(score: ConditionalScore, track: Tracks, k: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def sweep(score: ConditionalScore, track: Tracks, mask: Tensor, together: int = 1) -> Tensor:
+def sweep(score: ConditionalScore, track: Tracks, mask: Tensor, together: int) -> Tensor:
     """Take out `together` neighbouring keyframes of a mask (N, T) at a time, left to right, and choose them again.
 
     A change is kept where it makes the error of linear interpolation smaller, so a sweep never makes a mask worse.

@@ -12,11 +12,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from sfms_robot import config
 
 DECAY = 0.99  # of a vector's running mean, per step
 DEAD = 0.05  # a vector used less than this share of the average starts again at a keyframe
@@ -82,8 +83,7 @@ class Codebook(nn.Module):
         with torch.autocast(codes.device.type, enabled=False):  # nearest is a matter of small differences
             distance = self.vectors.square().sum(-1)[:, None] - 2 * flat @ self.vectors.transpose(1, 2)
         absent = torch.arange(self.vectors.shape[1], device=codes.device) >= self.sizes[:, None]
-        found = distance.masked_fill(absent[:, None], torch.inf).argmin(-1)
-        return found.transpose(0, 1).view(codes.shape[:-1])
+        return distance.masked_fill(absent[:, None], torch.inf).argmin(-1).transpose(0, 1).view(codes.shape[:-1])
 
     def codes(self, indices: Tensor) -> Tensor:
         """Return the codes (..., G, D) of indices (..., G)."""
@@ -152,21 +152,13 @@ class Quantizer(nn.Module):
     Ours: channels are cut into groups, each with separate keyframes and codes; the paper has one code per frame.
     """
 
-    def __init__(
-        self,
-        member: Tensor,
-        levels: Sequence[Sequence[int]],
-        kind: Literal["fsq", "vq"] = "fsq",
-        dims: int = 4,
-        squashed: bool = False,
-    ) -> None:
-        """Make one for groups `member` (G, C), 1 where a channel belongs to a group, with prod(levels) codes each.
+    def __init__(self, member: Tensor, settings: config.Sfms) -> None:
+        """Make one for the groups of the settings: `member` (G, C), 1 where a channel belongs to a group.
 
-        A channel of no group is not drawn: it stays 0. `dims` are those of a learned codebook, `squashed`: which
-        lies in -1..1, as a grid does.
+        A channel of no group is not drawn: it stays 0.
         """
         super().__init__()
-        groups, _ = member.shape
+        groups, learned = list(settings.groups.values()), settings.quantizer == "vq"
         own = [row.nonzero()[:, 0] for row in member]
         most = max(map(len, own))
         self.member = nn.Buffer(member, persistent=False)
@@ -178,11 +170,14 @@ class Quantizer(nn.Module):
         slot = ((member.cumsum(-1) * member).amax(0).long() - 1).clamp(min=0)
         self.owner = nn.Buffer(member.argmax(0), persistent=False)  # (C,) group of a channel
         self.place = nn.Buffer(self.owner * most + slot, persistent=False)  # (C,) of a channel in all slots
-        sizes = [math.prod(row) for row in levels]
-        self.codebook: Grid | Codebook = Grid(levels) if kind == "fsq" else Codebook(sizes, dims)
-        self.dims, self.squashed = self.codebook.dims, squashed and kind == "vq"
-        self.encoder = GroupMLP(groups, most, self.dims)
-        self.decoder = GroupMLP(groups, self.dims, most)
+        self.codebook: Grid | Codebook = (
+            Codebook([group.codes for group in groups], settings.code_dims)
+            if learned
+            else Grid([group.levels for group in groups])
+        )
+        self.dims, self.squashed = self.codebook.dims, settings.squashed and learned
+        self.encoder = GroupMLP(len(groups), most, self.dims)
+        self.decoder = GroupMLP(len(groups), self.dims, most)
 
     def latent(self, motion: Tensor) -> Tensor:
         """Return (B, T, G, D), not yet codes, of standardised motion (B, T, C)."""

@@ -36,7 +36,6 @@ from sfms_robot.listeners.engine import Engine, RunsOnEngine, stacked
 from sfms_robot.listeners.idle import HEAD, HeadSway
 from sfms_robot.listeners.sfms.draw import (
     UNDECIDED,
-    CodeReach,
     Context,
     EventCourse,
     Sampler,
@@ -125,10 +124,6 @@ class SfmsListener(RunsOnEngine):
         mask = neutral_mask(settings.past_frames, len(settings.groups))
         neutral, (codes,) = engine.run("rest", self._still(settings.past_frames)[None], mask[None])
         self._neutral = neutral[0]
-        groups = settings.groups.values()
-        own = [[settings.channels.index(name) for name in group.channels] for group in groups]
-        # Ours: each group of channels has its own codebook; the paper has one code per frame.
-        sizes, bounded = [group.codes for group in groups], settings.sampling.reach
         p = settings.past_frames
         self._unheard = SpeakerState(
             audio=self.frontend.start(),
@@ -139,8 +134,7 @@ class SfmsListener(RunsOnEngine):
             face=np.zeros((p, self.space.dim), np.float32),
             face_known=np.zeros(p, np.bool_),
         )
-        reach = CodeReach(codes, own, sizes, self._scales["motion_speed"], bounded)
-        self.sampler = Sampler(settings, engine, reach, self._courses(codes))
+        self.sampler = Sampler(settings, engine, codes, self._courses(codes))
 
     def _courses(self, codes: Floats) -> list[EventCourse]:
         """Return the courses that this listener keeps to; `codes` (V, C): standardised motion of every code."""
@@ -238,8 +232,7 @@ class SfmsListener(RunsOnEngine):
         inputs = Context(**seen, tokens=tokens, control=control)
         tokens, path = self.plan(inputs, settled, way, [memory.seed for memory in memories], newest)
         # 5. The path becomes motion: the head smoothed, its slow sway added, in our motion space.
-        sway = stacked([memory.sway for memory in memories])
-        motion = self.with_sway(self.shown(path), sway, np.array(newest) + 1)
+        motion = self.with_sway(self.shown(path), stacked([memory.sway for memory in memories]), np.array(newest) + 1)
         found = []
         for row, (at_s, memory) in enumerate(zip(times_s, memories, strict=True)):
             after = changed(memory, speaker=speakers[row], tokens=tokens[row], control=control[row], path=path[row])
@@ -254,8 +247,7 @@ class SfmsListener(RunsOnEngine):
             sway: (..., 3, L, S) of each stream.
             first: of all streams, or (...) of each.
         """
-        motion = shown * self._scales["motion_std"] + self._scales["motion_mean"]
-        return self.sway.added(motion, sway, first)
+        return self.sway.added(shown * self._scales["motion_std"] + self._scales["motion_mean"], sway, first)
 
     def shown(self, path: Floats) -> Floats:
         """Return the future (..., H, C) of a path (..., 2 + H, C), standardised, with the head smoothed."""

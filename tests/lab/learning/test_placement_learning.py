@@ -23,7 +23,7 @@ def bumps(count: int, frames: int = 24, seed: int = 0) -> torch.Tensor:
 
 def score_network() -> ConditionalScore:
     torch.manual_seed(0)
-    return ConditionalScore(1, 16, 2, 1)
+    return ConditionalScore(1, config.listener.Scores(width=16, heads=2, layers=1))
 
 
 def test_what_is_best_has_no_regret_and_following_the_teacher_ends_at_the_best_mask():

@@ -183,11 +183,10 @@ def test_nods_come_out_as_told_and_when(hop: int):
 
 
 def listener_with_speed(speed: float, bounded: bool = True):
-    listener = tiny_listener()
+    listener = tiny_listener(sampling={"reach": bounded})
     listener.model.motion_speed.fill_(speed)
-    groups = [range(6), range(6, 58)]
     codes = listener.engine.run("rest", np.zeros((1, 40, 58), np.float32), np.zeros((1, 40, 2), np.float32))[1][0]
-    return listener.model, draw.CodeReach(codes, groups, [6, 8], listener.engine.tensors["motion_speed"], bounded)
+    return listener.model, draw.CodeReach(listener.settings, codes, listener.engine.tensors["motion_speed"])
 
 
 def test_a_code_may_follow_itself_class_0_anything_and_without_bounds_every_code():

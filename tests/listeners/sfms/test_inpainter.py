@@ -17,8 +17,8 @@ MEMBER = torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]])
 
 def parts(residual: bool = True, layers: int = 1) -> tuple[Quantizer, Inpainter]:
     torch.manual_seed(0)
-    quantizer = Quantizer(MEMBER, [[5, 5], [5, 5]])
     settings = tiny_settings(tokenizer_width=8, tokenizer_layers=layers, inpainter="residual" if residual else "paper")
+    quantizer = Quantizer(MEMBER, settings)
     return quantizer, Inpainter(quantizer, settings).eval()
 
 

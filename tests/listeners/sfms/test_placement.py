@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sfms_robot.config.listener import Scores
 from sfms_robot.listeners.sfms.piecewise_linear import Neighbours, completion_errors, mask_cost, segments
 from sfms_robot.listeners.sfms.placement import (
     ConditionalScore,
@@ -27,6 +28,7 @@ from sfms_robot.listeners.sfms.placement import (
 )
 
 MEMBER = torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+SMALL = Scores(width=8, heads=2, layers=1)
 
 
 def errors(motion: torch.Tensor, mask: torch.Tensor, ramp: int | None = None) -> torch.Tensor:
@@ -48,7 +50,7 @@ def test_exact_placement_beats_every_other_mask(first: int, second: int, seed: i
 @cache
 def scores(strategy: str) -> ScoreNetwork | ConditionalScore:
     torch.manual_seed(0)
-    return (ScoreNetwork(3, 2, 8, 2, 2) if strategy == "learned_paper" else ConditionalScore(2, 8, 2, 1)).eval()
+    return (ScoreNetwork(3, 2, SMALL) if strategy == "learned_paper" else ConditionalScore(2, SMALL)).eval()
 
 
 @pytest.mark.parametrize("strategy", sorted({*get_args(Strategy)} - {"penalised", "adaptive"}))
