@@ -21,7 +21,6 @@ import os
 import platform
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -82,11 +81,11 @@ class RunsOnEngine:
     """
 
     engine: Engine
-    hop: int = 1
+    hop = 1
     hops: Sequence[int] = (1,)
-    horizon: int = 1
-    control_frames: tuple[int, int] = (0, 0)
-    control_columns: int = 0
+    horizon = 1
+    control_frames = (0, 0)
+    control_columns = 0
 
     def at_hop(self, hop: int) -> Self:
         """Return a listener of the same weights that plans every `hop` frames, one of `hops`."""
@@ -113,10 +112,7 @@ class RunsOnEngine:
         return self.step_each([speaker], [memory], [control])[0]
 
     def step_each(
-        self,
-        speakers: Sequence[SpeakerFrame],
-        memories: Sequence[Any],
-        controls: Sequence[Floats | None] | None = None,
+        self, speakers: Sequence[SpeakerFrame], memories: Sequence[Any], controls: Sequence[Floats | None] | None = None
     ) -> list[tuple[Plan | None, Any]]:
         """Run `step` of N streams of different people, one frame and one memory each, in a fraction of the time.
 
@@ -172,49 +168,40 @@ OUTSIDE_GROUPS: Final = ("keyframes", "keyframe_cost", "transition_bias")
 LATER: Final[Mapping[str, object]] = {"squashed": False, "schedule": "cosine"}
 
 
-@dataclass(frozen=True)
-class Graph:
+class Graph(BaseModel):
     """One network.
 
     Attributes:
-        data: the ONNX file.
+        sha256: hash of its ONNX file.
         weights: tensors of model.safetensors that it needs, by name.
-        rounded: those of them that it needs in 8 bits (`integers`).
+        integers: those of them that it needs in 8 bits (`integers`).
+        data: its ONNX file, once that was read.
     """
-
-    data: bytes
-    weights: tuple[str, ...]
-    rounded: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class GraphFolder:
-    """All graphs of a listener by network, and what `checkpoint.stored_tensors` has to find in model.safetensors."""
-
-    graphs: Mapping[str, Graph]
-    wanted: Shapes
-
-    @property
-    def in_integers(self) -> bool:
-        """Return whether any graph has layers in 8 bits."""
-        return any(graph.rounded for graph in self.graphs.values())
-
-
-class ListedGraph(BaseModel):
-    """A network in the list of graphs: the hash of its file, and its tensors as in `Graph`."""
 
     sha256: str
     weights: tuple[str, ...]
     integers: tuple[str, ...] = ()
+    data: bytes = b""
 
 
-class GraphList(BaseModel):
-    """The list of graphs: of which settings they are (`digest`), networks by name, and the tensors that they need."""
+class GraphFolder(BaseModel):
+    """The graphs of a listener, as their list has them.
+
+    Attributes:
+        settings: of which settings they are (`digest`).
+        networks: by name.
+        tensors: what `checkpoint.stored_tensors` has to find in model.safetensors.
+    """
 
     format: int
     settings: str
-    networks: dict[str, ListedGraph]
+    networks: dict[str, Graph]
     tensors: Shapes
+
+    @property
+    def in_integers(self) -> bool:
+        """Return whether any graph has layers in 8 bits."""
+        return any(graph.integers for graph in self.networks.values())
 
 
 def digest(settings: config.ListenerSettings) -> str:
@@ -242,7 +229,7 @@ def read_graphs(folder: Path, settings: config.ListenerSettings, integers: bool 
     """
     file, remedy = folder / FOLDER / MANIFEST, f"export them again: sfms-robot export {folder}"
     try:
-        listed = GraphList.model_validate_json(file.read_bytes())
+        listed = GraphFolder.model_validate_json(file.read_bytes())
     except OSError:
         raise ModelError(f"{file}: no graphs of this listener for engine onnx; {remedy}") from None
     except ValueError:
@@ -251,18 +238,18 @@ def read_graphs(folder: Path, settings: config.ListenerSettings, integers: bool 
         raise ModelError(f"{file}: graphs of format {listed.format}, this version has {FORMAT}; {remedy}")
     if listed.settings != digest(settings):
         raise ModelError(f"{file}: graphs of another configuration than {folder / 'config.yaml'}; {remedy}")
-    found, networks = {}, listed.networks
+    networks, listed.networks = listed.networks, {}
     for name in {network.removesuffix(".int8") for network in networks}:
         chosen = f"{name}.int8" if integers and f"{name}.int8" in networks else name
         graph, network = folder / FOLDER / f"{chosen}.onnx", networks[chosen]
         try:
-            data = graph.read_bytes()
+            network.data = graph.read_bytes()
         except OSError:
             raise ModelError(f"{graph}: no such graph; {remedy}") from None
-        if hashlib.sha256(data).hexdigest() != network.sha256:
+        if hashlib.sha256(network.data).hexdigest() != network.sha256:
             raise ModelError(f"{graph}: cut short, or of another model than {MANIFEST} next to it; {remedy}")
-        found[name] = Graph(data, network.weights, network.integers)
-    return GraphFolder(found, listed.tensors)
+        listed.networks[name] = network
+    return listed
 
 
 # --- onnxruntime ------------------------------------------------------------------------------------------------------
@@ -309,11 +296,11 @@ class OnnxEngine:
         """Use this many threads from now on; takes as long as loading."""
         if threads == self._threads:
             return
-        graphs = self._graphs.graphs
-        plain = {name for graph in graphs.values() for name in {*graph.weights} - {*graph.rounded}}
-        rounded = {name for graph in graphs.values() for name in graph.rounded}
+        graphs = self._graphs.networks
+        plain = {name for graph in graphs.values() for name in {*graph.weights} - {*graph.integers}}
+        rounded = {name for graph in graphs.values() for name in graph.integers}
         values, small = {}, {}
-        for name, weight in stored_tensors(self._folder / WEIGHTS, self._graphs.wanted):
+        for name, weight in stored_tensors(self._folder / WEIGHTS, self._graphs.tensors):
             if name in plain:
                 values[name] = _value(weight)
             if name in rounded:
@@ -349,8 +336,8 @@ def _session(failure: str, graph: Graph, values: Mapping[str, Any], threads: int
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # the servo loop has the other core
     options.log_severity_level = 3
-    names = [name for name in graph.weights if name not in graph.rounded]
-    names += [f"{name}.{part}" for name in graph.rounded for part in ("int8", "scale")]
+    names = [name for name in graph.weights if name not in graph.integers]
+    names += [f"{name}.{part}" for name in graph.integers for part in ("int8", "scale")]
     options.add_external_initializers(names, [values[name] for name in names])
     try:
         return onnxruntime.InferenceSession(graph.data, options, providers=["CPUExecutionProvider"])
