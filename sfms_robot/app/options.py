@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Final
 
 from sfms_robot.data import NO_HEAD, Names, head_file
 from sfms_robot.errors import ConfigError
-from sfms_robot.network import Router
-from sfms_robot.plugins import listener_folder
+from sfms_robot.network import Router, check_name
+from sfms_robot.plugins import REMOTE, listener_folder
 from sfms_robot.servo.discovery import AUTO, check_device
 from sfms_robot.sources.registry import BROWSER, check_source, split_kind
 
@@ -186,10 +186,17 @@ def calmed(per_minute: Sequence[str], addressed: str) -> Calmness:
 
 
 def begin_listening(options: RunOptions) -> NamedFeed:
-    """Return the listener, which loads or connects from now on, for `session.run(feed=...)`. The caller closes it."""
-    from sfms_robot.listeners.remote import open_feed
+    """Return the listener, which loads or connects from now on, for `session.run(feed=...)`. The caller closes it.
 
-    return open_feed(options.listener, options.seed, options.calmness, options.router, options.engine)
+    One on another machine chooses its engine itself. Raises ConfigError, MissingExtra.
+    """
+    from sfms_robot.listeners.process import ListenerProcess
+    from sfms_robot.listeners.remote import RemoteListener, ZenohLink
+
+    if not options.listener.startswith(REMOTE):
+        return ListenerProcess(options.listener, options.seed, options.calmness, options.engine)
+    served = check_name(options.listener.removeprefix(REMOTE), "listener")
+    return RemoteListener(served, ZenohLink(served, options.router), options.seed, options.calmness)
 
 
 def begin_page(

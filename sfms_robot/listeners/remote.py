@@ -32,7 +32,6 @@ from typing import TYPE_CHECKING, Any, Final
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import ListenerEvent, Plan, SpeakerFrame
-from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.remote_messages import (
     OURS,
@@ -48,7 +47,7 @@ from sfms_robot.listeners.remote_messages import (
     words_message,
 )
 from sfms_robot.listeners.remote_timing import ClockOffset, JitterBuffer
-from sfms_robot.network import LOCAL, Connection, Router, check_name, session_config
+from sfms_robot.network import Connection, Router, session_config
 from sfms_robot.plugins import REMOTE as PREFIX
 from sfms_robot.ports import Facts
 from sfms_robot.signals.quantiles import Quantiles
@@ -84,7 +83,7 @@ class RemoteListener:
         self._buffer = JitterBuffer(1, 1)
         self._clock = ClockOffset()
         self._step_ms, self._rtt_ms, self._delay_ms = Quantiles(), Quantiles(), Quantiles()
-        self._shown: deque[tuple[str, float]] = deque(maxlen=_SHOWN)
+        self._shown = deque[tuple[str, float]](maxlen=_SHOWN)
         self._asked_s = -math.inf
         self._waiting_since_s: float | None = None  # for an answer to a frame
         self._skipped = self._refused_messages = 0
@@ -284,11 +283,11 @@ class ZenohLink:
         where: the router, for people.
     """
 
-    def __init__(self, name: str, router: Router = LOCAL) -> None:
+    def __init__(self, name: str, router: Router) -> None:
         self._name = name
         self.where = str(router)
         self._connection = Connection(session_config("call", router))
-        self._received: deque[tuple[float, bytes]] = deque(maxlen=MOST_RECEIVED)
+        self._received = deque[tuple[float, bytes]](maxlen=MOST_RECEIVED)
         self._publisher: zenoh.Publisher | None = None
         self._subscriber: Any = None
 
@@ -349,21 +348,4 @@ class ZenohLink:
         self._received.append((time.monotonic(), sample.payload.to_bytes()))
 
 
-# --- A listener by its name -------------------------------------------------------------------------------------------
-
-NamedFeed = ListenerProcess | RemoteListener
-
-
-def open_feed(
-    name: str, seed: int, calmness: Calmness | None = None, router: Router = LOCAL, engine: EngineName = "auto"
-) -> NamedFeed:
-    """Return a feed that loads in a child process, or connects, from now on; `wait_loaded` waits.
-
-    `router`: to a listener on another machine, which chooses its engine itself.
-
-    Raises ConfigError, MissingExtra.
-    """
-    if not name.startswith(PREFIX):
-        return ListenerProcess(name, seed, calmness, engine)
-    served = check_name(name.removeprefix(PREFIX), "listener")
-    return RemoteListener(served, ZenohLink(served, router), seed, calmness)
+NamedFeed = ListenerProcess | RemoteListener  # of a run whose listener has a name
