@@ -68,8 +68,7 @@ class AudioFrontend:
         from sfms_robot.signals.wav2vec2 import Wav2Vec2
 
         model = Wav2Vec2((folder or Path()) / settings.wav2vec2)
-        if model.dim != SHAPES["wav2vec2"][1]:
-            wanted = SHAPES["wav2vec2"][1]
+        if model.dim != (wanted := SHAPES["wav2vec2"][1]):
             raise ConfigError(f"{model.folder}: hidden_size: expected {wanted} numbers per frame, got {model.dim}")
         return cls(settings.audio, settings.phase, model)
 
@@ -189,5 +188,4 @@ def check_length(samples: Floats) -> None:
 
 
 def _with_phrase(rows: Floats, voiced: list[bool]) -> tuple[Floats, Bools]:
-    places = phase.features(phase.times(voiced))
-    return np.concatenate([rows, places], axis=1), np.array(voiced, dtype=np.bool_)
+    return np.concatenate([rows, phase.features(phase.times(voiced))], axis=1), np.array(voiced, dtype=np.bool_)

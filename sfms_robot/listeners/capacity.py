@@ -89,7 +89,7 @@ class Capacity:
 
 
 def measure_capacity(
-    listener: Listener, sizes: Sequence[int] = SIZES, now_s: Callable[[], float] = time.perf_counter
+    listener: Listener, sizes: Sequence[int], now_s: Callable[[], float] = time.perf_counter
 ) -> Capacity:
     """Step batches of silence and return the medians of their durations. Blocks for a second or two."""
     plan_s: list[float] = []

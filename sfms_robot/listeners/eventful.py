@@ -72,7 +72,7 @@ class EventfulListener(RunsOnEngine):
     """A listener of parts: `when` decides, `how` moves, `idle` moves a face at rest. Takes no control."""
 
     def __init__(
-        self, how: RunsOnEngine, when: EventModel, calmness: Calmness | None = None, idle: IdleMotion | None = None
+        self, how: RunsOnEngine, when: EventModel, calmness: Calmness | None, idle: IdleMotion | None = None
     ) -> None:
         self.how, self.when, self.calmness, self.idle = how, when, calmness or Calmness(), idle
         self.engine, self.hop, self.hops, self.horizon = how.engine, how.hop, how.hops, how.horizon

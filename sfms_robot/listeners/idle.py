@@ -294,16 +294,14 @@ class IdleMotion:
         """Draw the idle motion of a stream by its seed."""
         rng = np.random.default_rng([_SEED, seed])
         edges, (bands, parts) = np.array(IDLE_BANDS_HZ), self.amplitude.shape
-        uniform = rng.random((bands, IDLE_LINES, parts))
-        frequency_hz = edges[:-1, None, None] + uniform * np.diff(edges)[:, None, None]
+        frequency_hz = edges[:-1, None, None] + rng.random((bands, IDLE_LINES, parts)) * np.diff(edges)[:, None, None]
         size = math.exp(self.spread * rng.standard_normal() - self.spread**2)  # of power 1 in the mean
         factors = (
             size
             * rng.standard_normal((2, bands, IDLE_LINES, parts))
             * (self.amplitude / math.sqrt(IDLE_LINES))[:, None]
         )
-        cosine, sine = factors.reshape(2, bands * IDLE_LINES, parts)
-        sizes, phase = as_cosines(cosine, sine)
+        sizes, phase = as_cosines(*factors.reshape(2, bands * IDLE_LINES, parts))
         frequency = 2 * math.pi * frequency_hz.reshape(bands * IDLE_LINES, parts)
         rest = RestMap.between(self.held, self.shown)
         return IdleStream(

@@ -274,8 +274,7 @@ def weighted_mean(x: Tensor, weights: Tensor | None) -> Tensor:
 
 def windows(x: Tensor, size: int) -> Tensor:
     """Return (B, T, size, D) of x (B, T, D): each frame and those before it, the first one repeated (A.2)."""
-    padded = torch.cat([x[:, :1].expand(-1, size - 1, -1), x], dim=1)
-    return padded.unfold(1, size, 1).transpose(-1, -2)
+    return torch.cat([x[:, :1].expand(-1, size - 1, -1), x], dim=1).unfold(1, size, 1).transpose(-1, -2)
 
 
 class CrossAttention(nn.Module):

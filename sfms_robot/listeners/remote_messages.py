@@ -204,10 +204,9 @@ class Interface:
 
     def __str__(self) -> str:
         """Return it as words."""
-        space = f"{self.motion} ({len(self.channels)} channels)"
         return (
             f"sfms-robot {self.version}, protocol {self.protocol}, {self.frame_hz} frames a second, "
-            f"{self.audio_hz} Hz, {space}"
+            f"{self.audio_hz} Hz, {self.motion} ({len(self.channels)} channels)"
         )
 
     def fits(self, other: Interface) -> bool:
@@ -297,7 +296,7 @@ class _Reader:
             raise PacketError(f"{what}: expected protocol {PROTOCOL}, got protocol {protocol}")
         if found != kind:
             raise PacketError(f"{what}: expected a message of kind {kind}, got kind {found}")
-        self.header: tuple[Any, ...] = form.unpack(self.bytes(form.size))
+        self.header = form.unpack(self.bytes(form.size))
 
     def bytes(self, count: int) -> bytes:
         end = self._at + count

@@ -58,7 +58,7 @@ class ClockOffset:
     """The samples of the last `WINDOW_S`."""
 
     def __init__(self) -> None:
-        self._samples: deque[ClockSample] = deque()
+        self._samples = deque[ClockSample]()
 
     def observe(self, sent_s: float, their_came_s: float, their_sent_s: float, came_s: float) -> None:
         """Add an exchange: t1 to t4 of the module's text."""
@@ -96,7 +96,7 @@ class JitterBuffer:
     def __init__(self, horizon: int, hop: int) -> None:
         self._reach_s = max(horizon - 1, 1) * FRAME_S
         self._hop = hop
-        self._delays_s: deque[float] = deque(maxlen=DELAYS)
+        self._delays_s = deque[float](maxlen=DELAYS)
         self._waiting: dict[int, Plan] = {}  # by number
         self._given: int | None = None  # number of the newest plan given
         self._from_s = -math.inf  # plans made before it were delayed by an outage

@@ -74,10 +74,7 @@ SPACES: Final[Mapping[str, Space]] = {
         neutral=(np.pi, 0.0, 0.0),
     ),
     "deca56": Space(
-        expression=slice(0, 50),
-        rotation=slice(50, 53),
-        jaw=slice(53, 56),
-        axes=((0, 0, 1), (1, 0, 0), (0, 1, 0)),
+        expression=slice(0, 50), rotation=slice(50, 53), jaw=slice(53, 56), axes=((0, 0, 1), (1, 0, 0), (0, 1, 0))
     ),
 }
 

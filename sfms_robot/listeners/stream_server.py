@@ -153,16 +153,10 @@ class StreamServer:
         counts: so far, see `Figures`.
     """
 
-    def __init__(
-        self,
-        listener: Listener,
-        name: str,
-        capacity: Capacity | None = None,
-        server: str = "server",
-    ) -> None:
+    def __init__(self, listener: Listener, name: str, capacity: Capacity | None = None, server: str = "server") -> None:
         self._listener, self._name, self._capacity = listener, name, capacity
         self._server = f"{server}-{secrets.token_hex(3)}"
-        self.counts: Counter[str] = Counter()
+        self.counts = Counter[str]()
         self._delays_s, self._batch_sizes = deque[float](maxlen=RECENT), deque[int](maxlen=RECENT)
         self._streams: dict[str, _Stream] = {}
         self._most = self._batch_limit()
@@ -292,11 +286,11 @@ class StreamServer:
     def batch(self) -> Batch | None:
         """Return what is to be stepped next, or None. Its streams are in no other batch until `finish`."""
         # A frame that needs no plan may wait until the one that does.
-        ready = sorted(self._ready(), key=lambda each: each.waiting[0].deadline_s + each.to_plan * FRAME_S)
-        for stream in ready[: self._most]:
+        due = sorted(self._ready(), key=lambda each: each.waiting[0].deadline_s + each.to_plan * FRAME_S)[: self._most]
+        for stream in due:
             stream.stepping = True
             stream.memory, stream.calmness = calmed(self._listener, stream.memory, stream.calmness), None
-        return [(stream, stream.waiting.popleft()) for stream in ready[: self._most]] or None
+        return [(stream, stream.waiting.popleft()) for stream in due] or None
 
     def _ready(self) -> list[_Stream]:
         return [each for each in self._streams.values() if each.waiting and not each.stepping]

@@ -45,9 +45,9 @@ class Inbox:
     """
 
     def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[SpeakerFrame | None] = queue.SimpleQueue()
+        self._queue = queue.SimpleQueue[SpeakerFrame | None]()
         self._allowed: float | None = None  # to wait, while it catches up with those of before
-        self._waiting: deque[SpeakerFrame | None] = deque()
+        self._waiting = deque[SpeakerFrame | None]()
         self.skipped = 0
         self.calmness: Calmness | None = None
         self.hop: int | None = None
@@ -58,9 +58,7 @@ class Inbox:
 
     def next(self) -> SpeakerFrame | None:
         """Return the next frame; blocks until there is one. None, the end, comes before all that waits."""
-        if not self._waiting:
-            self._waiting.append(self._queue.get())
-        while not self._queue.empty():
+        while not self._waiting or not self._queue.empty():
             self._waiting.append(self._queue.get())
         if None in self._waiting:
             return None
@@ -114,7 +112,7 @@ class Lateness:
     def __init__(self) -> None:
         self.lasting = False
         self._since_s: float | None = None  # of the first late one in a row
-        self._given: deque[tuple[float, float]] = deque(maxlen=2 * FRAME_HZ)  # time of a frame, and how late it came
+        self._given = deque[tuple[float, float]](maxlen=2 * FRAME_HZ)  # time of a frame, and how late it came
         self._source_said = False
 
     def named(self, state: str) -> str:
@@ -150,7 +148,7 @@ class ListenerThread:
     def __init__(self, listener: Listener, seed: int) -> None:
         self._listener, self._seed = listener, seed
         self._inbox = Inbox()
-        self._said: queue.SimpleQueue[tuple[str, Any]] = queue.SimpleQueue()
+        self._said = queue.SimpleQueue[tuple[str, Any]]()
         self._step_ms = Quantiles()
         self._lateness = Lateness()
         self._unanswered = self._skipped = 0  # frames

@@ -174,7 +174,7 @@ class ArigModel(ListenerModel):
 
     # --- Motion and draws: the table above ----------------------------------------------------------------------------
 
-    def expected(self, last: Tensor, rows: Tensor | None = None) -> Tensor:
+    def expected(self, last: Tensor, rows: Tensor | None) -> Tensor:
         """Return the standardised motion (..., C) that a draw of 0 gives after `last` (..., C); `rows` (..., 2K)."""
         if self.settings.draws != "innovation":
             return last  # ours (`step`), because a still face stays still
@@ -238,10 +238,10 @@ class ArigModel(ListenerModel):
 
         What is drawn around the mean has the sampler's range, and so has the sum: no step is larger than in the data.
         """
-        if not isinstance(self.head, Denoiser):
-            return self.head.sample(z, noise)
         drawn = self.head.sample(z, noise)
-        return drawn if self.mean is None else (drawn + self.mean(z)).clamp(self.head.low, self.head.high)
+        if self.mean is not None and isinstance(self.head, Denoiser):
+            drawn = (drawn + self.mean(z)).clamp(self.head.low, self.head.high)
+        return drawn
 
     def sample_loss(
         self,

@@ -87,8 +87,7 @@ class Bidirectional(nn.Module):
         # One attention over the 2c tokens of both: each track's queries see both tracks' keys.
         agent_qkv, agent_parts = self.agent.ask(agent, agent_sound)
         user_qkv, user_parts = self.user.ask(user, user_sound)
-        seen = _attend(torch.cat([agent_qkv, user_qkv], dim=1), self.heads)
-        of_agent, of_user = seen.chunk(2, dim=1)
+        of_agent, of_user = _attend(torch.cat([agent_qkv, user_qkv], dim=1), self.heads).chunk(2, dim=1)
         return self.agent.answer(agent, of_agent, agent_parts), self.user.answer(user, of_user, user_parts)
 
 
@@ -199,8 +198,7 @@ class ContextLayer(nn.Module):
         scores = torch.where(seen, scores, -torch.inf)
         self_score = (q * k).sum(-1, keepdim=True)  # the token itself is scored apart: the cache is not copied
         weights = torch.cat([scores, self_score], dim=-1).softmax(dim=-1)
-        y = weights[..., :-1] @ past[1] + weights[..., -1:] * v
-        x = x + self.out(join_heads(y))
+        x = x + self.out(join_heads(weights[..., :-1] @ past[1] + weights[..., -1:] * v))
         out: Tensor = x + self.ffn(self.ffn_norm(x))
         return out
 
@@ -355,7 +353,7 @@ class Progressive(nn.Module):
         sound: Tensor,
         cis: Tensor,
         state: Tensor | None,
-        events: Tensor | None = None,
+        events: Tensor | None,
     ) -> Tensor:
         """Return z (N, D) of a coarse motion.
 

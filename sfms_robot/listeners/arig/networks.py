@@ -73,8 +73,7 @@ class FrameNetwork(Network[ArigModel]):
             sound_keys.
         """
         model = self.model
-        absent = torch.stack([model.no_user_sound, model.no_agent_sound])
-        embedded = model.embed_sound(sounds, heard, absent)
+        embedded = model.embed_sound(sounds, heard, torch.stack([model.no_user_sound, model.no_agent_sound]))
         user_sound, now = embedded[:, 0], embedded[:, 1]  # A^u_(T-1) and A^a_T, (N, D)
         face = model.embed_face(face, seen)  # M^u_(T-1)
         # 3.2: behaviours I_(T-1) of both; the agent's is made with the sound kept from the frame before.

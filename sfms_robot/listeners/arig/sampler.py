@@ -67,8 +67,7 @@ class Denoiser(nn.Module):
         # sigma of each step times the temperature of each channel, (K, C); the first row is the initial noise. Ours:
         # early noise decides what happens, late noise is jitter, so the temperature may change from first to last step.
         first, last = torch.tensor([settings.temperature_of(name) for name in names]).unbind(-1)
-        late = torch.linspace(0, 1, max(1, settings.steps - 1))[:, None]
-        temperature = first + late * (last - first)  # (K - 1, C)
+        temperature = first + torch.linspace(0, 1, max(1, settings.steps - 1))[:, None] * (last - first)  # (K - 1, C)
         spread = torch.tensor([step.spread for step in self.table[:-1]])[:, None]
         spreads = torch.cat([torch.ones(1, channels), spread * temperature[: len(spread)]])
         self.spreads = nn.Buffer(spreads, persistent=False)
@@ -111,8 +110,7 @@ class Denoiser(nn.Module):
         # M_t = sqrt(ab_t) M_0 + sqrt(1 - ab_t) eps
         noisy = alpha_bar.sqrt() * motion + (1 - alpha_bar).sqrt() * noise
         # eps_theta(M_t | t, z)
-        found = self(noisy, self.modulate(z, self.level(t)))
-        return weighted_mean((noise - found).square(), weights)
+        return weighted_mean((noise - self(noisy, self.modulate(z, self.level(t)))).square(), weights)
 
     def sample(self, z: Tensor, noise: Tensor) -> Tensor:
         """Return standardised motion (N, C) of conditions, equation (4).
@@ -205,8 +203,7 @@ class CodeHead(nn.Module):
         # B.1: the softmax learns which code; encoder and decoder learn from what the code makes of the motion.
         code = self.grid.nearest(self.encode(motion)[:, None])  # (N, 1, dims)
         rebuilt = weighted_mean((self.decode(code[:, 0]) - motion).square(), weights)
-        index = self.grid.indices(code.detach())[:, 0]
-        wrong: Tensor = F.cross_entropy(self.classify(z), index, reduction="none")
+        wrong: Tensor = F.cross_entropy(self.classify(z), self.grid.indices(code.detach())[:, 0], reduction="none")
         return rebuilt + wrong
 
     def sample(self, z: Tensor, noise: Tensor) -> Tensor:

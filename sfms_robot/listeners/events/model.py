@@ -32,16 +32,7 @@ from sfms_robot.config import Calmness, Model, load
 from sfms_robot.config.base import Finite, NonNegative, Positive
 from sfms_robot.data import data_dir
 from sfms_robot.frames import EVENT_KINDS, FRAME_S, Doubles, Events, ListenerEvent, SpeakerFrame, changed
-from sfms_robot.listeners.events.evidence import (
-    AT,
-    EVIDENCE,
-    NUMBERS,
-    Sensed,
-    SenseMemory,
-    done,
-    remembered,
-    sense,
-)
+from sfms_robot.listeners.events.evidence import AT, EVIDENCE, NUMBERS, Sensed, SenseMemory, done, remembered, sense
 from sfms_robot.listeners.stream_rng import Use, uniforms
 from sfms_robot.signals.event_sizes import RETURN_SIZE, SHAKE, SWINGS_HZ, aside, swing_reach_rad, swings
 from sfms_robot.signals.phase import log_time
@@ -130,9 +121,9 @@ class HazardBank:
     """
 
     def __init__(self, hazards: Mapping[str, Hazard]) -> None:
-        self.kinds: tuple[str, ...] = tuple(hazards)
-        self.terms: tuple[tuple[str, ...], ...] = tuple(tuple(hazards[kind].weights) for kind in self.kinds)
-        self._intercepts = np.array([hazards[kind].intercept for kind in self.kinds])
+        self.kinds = tuple(hazards)
+        self.terms = tuple(tuple(hazard.weights) for hazard in hazards.values())
+        self._intercepts = np.array([hazard.intercept for hazard in hazards.values()])
         self._first_term = np.cumsum([0, *map(len, self.terms)])  # of each kind
         base: list[float] = []  # first value of each term
         first: list[int] = []  # interval of each term

@@ -61,13 +61,11 @@ def conversation(voice=VOICE, attention=None, face=None, agent=None):
 def listen(frames, seed=1, calmness=None, own=None, memory=None):
     """All events, and the nod hazard of every frame."""
     memory = memory or MODEL.start(seed, calmness or Calmness())
-    events: list[ListenerEvent] = []
-    hazards = []
+    events, hazards = [], []
     for frame in frames:
         sensed, heard = sense(frame, memory.sensed)
-        if own is not None:
-            memory = replace(memory, done=tuple(event for event in own if event.start_s < frame.time_s - EPS_S))
-        ((decided, memory),) = MODEL.decide_each([sensed], [memory])
+        done = memory.done if own is None else tuple(one for one in own if one.start_s < frame.time_s - EPS_S)
+        ((decided, memory),) = MODEL.decide_each([sensed], [replace(memory, done=done)])
         memory = replace(memory, sensed=heard)
         events += decided
         hazards.append(memory.hazards_hz["nod"])
