@@ -252,7 +252,7 @@ def wait(chains: Sequence[Chain]) -> Chain:
 
 
 def _check(servos: Sequence[EmulatedServo], maps: Sequence[FirmwareMap]) -> None:
-    seen: set[tuple[str, int]] = set()
+    seen = set[tuple[str, int]]()
     for servo, table in zip(servos, maps, strict=True):
         highest = 252 if table.channels is None else table.channels - 1
         key = ("" if table.channels is None else servo.model, servo.id)

@@ -149,7 +149,7 @@ class WireBus(ABC, Generic[L]):
         self._reconnect_s = config.reconnect_s  # time without any answer after which the bus has failed
         self._counts = dict.fromkeys(COUNTS, 0)
         self._link: L | None = None
-        self._powered: frozenset[int] = frozenset()  # ids whose torque came on and is not confirmed off
+        self._powered = frozenset[int]()  # ids whose torque came on and is not confirmed off
         self._forget_silence()
 
     def _forget_silence(self) -> None:

@@ -51,7 +51,7 @@ class Writer:
         self._goals: tuple[Doubles, float] | None = None
         self._readings: Readings = {}
         self._read_s = 0.0
-        self._back: set[str] = set()
+        self._back = set[str]()
         self._failure: Exception | None = None
         self._closing = False
         self._thread = start_thread(self._run, f"bus of {bus.joints[0]}")

@@ -328,7 +328,7 @@ class PageVisitor:
         self.voice, self.sight = BrowserVoice(self), BrowserSight(self)
         self._lock = threading.Lock()
         self._number: int | None = None
-        self._feeds: frozenset[str] = frozenset()
+        self._feeds = frozenset[str]()
         self._clock, self._intake = SenderClock(), Intake(now)
 
     def came(self, number: int, feeds: Sequence[str]) -> None:

@@ -69,7 +69,7 @@ class NetServer(ServerThread):
 
     def __init__(self, flag: str, host: str, port: int) -> None:
         self.counts = dict.fromkeys(("connections", "refused", "messages", "malformed", "missed"), 0)
-        self.connections: set[NetProgram] = set()
+        self.connections = set[NetProgram]()
         self._said = Said()
         super().__init__(flag, host, port, _STOP_S)
         self._posted = deque[Callable[[], None]](maxlen=4 * OUTBOX)
@@ -134,7 +134,7 @@ class NetProgram:
         self.name = address_text(*writer.get_extra_info("peername", ("an unknown address", 0))[:2])
         self.greeted, self.malformed, self.clock = False, 0, SenderClock()
         self._told = Said()
-        self.wants: frozenset[str] = frozenset()
+        self.wants = frozenset[str]()
         self._server, self._reader, self._writer = server, reader, writer
         self._loop = asyncio.get_running_loop()
         self._wire: TcpWire | WebSocketWire | None = None

@@ -171,10 +171,10 @@ class VmcDecoder(Decoder):
         self.restart()
 
     def restart(self) -> None:
-        self._unknown: set[bytes] = set()
+        self._unknown = set[bytes]()
         self._values = [0.0] * len(_NAMES)
-        self._known: set[int] = set()  # places
-        self._pending: set[int] = set()  # places whose values are not applied yet
+        self._known = set[int]()  # places
+        self._pending = set[int]()  # places whose values are not applied yet
         self._pending_s = 0.0  # since when
         self._applies = False  # the sender says when a face is complete
         self._turned = False

@@ -102,7 +102,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._enabled = False
         self._places = _NO_PLACES  # members that get goals
         self._rejoining: list[Member] = []  # members that wait for goals that begin where they stand
-        self._arrived: set[int] = set()  # indices of members that came to hold a position in this poll
+        self._arrived = set[int]()  # indices of members that came to hold a position in this poll
         self._stamp_s = 0.0
         self._peak_mA = 0.0
         self._released_ids = [servo.id for servo in servos if servo.safety.stop == "release"]

@@ -142,7 +142,7 @@ class Member:
         self.mismatch: str | None = None
         self._faults = faults
         self._reported = reported
-        self._ignored: set[str] = set()  # faults that do not count, each logged once
+        self._ignored = set[str]()  # faults that do not count, each logged once
         self._bits = 0
         self._named: list[str] = []  # faults it reports, those that count
         self._trouble: str | None = None  # any other fault

@@ -128,7 +128,7 @@ class StatusPoll:
         self._rotation, self._looks, self._currents = Rotation(), Rotation(), Rotation()
         self._polls = 0
         self._turn = 0
-        self._flagged: set[int] = set()  # ids whose status says that something is wrong
+        self._flagged = set[int]()  # ids whose status says that something is wrong
         self._missing = set(self._by_id)  # ids of members that have to be notified when they answer
         self._answered: list[int] = []  # ids that answered in this poll, and may be asked for more
         self._plan()
@@ -139,10 +139,10 @@ class StatusPoll:
         `group`: one request for several is worth a try. All servos with fast reads answer it.
         """
         if self.link.has_fast_read:
-            wanted, position = self._config.fast_read, self._telemetry.position
+            wanted = self._config.fast_read
             fast = wanted == "on"
             if wanted == "auto":
-                fast = len(self.link.read_many(*position, present, fast=True)) == len(present)
+                fast = len(self.link.read_many(*self._telemetry.position, present, fast=True)) == len(present)
             self.restart(grouped=True, fast=fast, proven=wanted == "auto")
             return
         if group:

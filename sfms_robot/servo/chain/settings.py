@@ -42,7 +42,7 @@ class Settings:
         self._members = {member.id: member for member in members}
         self._torque = torque
         self._pending: dict[str, dict[int, tuple[Field, int]]] = {}  # writes not confirmed yet, by register name
-        self._read_first: set[tuple[int, str]] = set()  # of them, those that are not written before they are read
+        self._read_first = set[tuple[int, str]]()  # of them, those that are not written before they are read
         self._changed: dict[int, dict[str, int]] = {}  # values other than those of startup
         self._differing: dict[int, dict[str, tuple[int, int]]] = {}  # (seen, wanted) by name
         self._round: list[tuple[Block, int]] = []  # reads of one servo each, still to be made in this round

@@ -200,7 +200,7 @@ class Startup(ABC):
         Then goal := present and the usual profile; returns the position held. Whatever ends it before, also a caller
         that closes it, leaves torque off.
         """
-        table, servo = self.table, self.servo.id
+        table = self.table
         drive_mode = table.fields.get("drive_mode")
         mode = 0 if drive_mode is None else self.value(drive_mode)
         way = way_inside(start, limits, table.ticks_per_revolution)
@@ -223,7 +223,7 @@ class Startup(ABC):
                 yield from self._write(table[name], usual.get(name, 0))
         except BaseException:
             with suppress(BusError):  # a port that is gone: nothing can be sent
-                self.link.sync_write(torque.address, {servo: torque.to_bytes(0)})
+                self.link.sync_write(torque.address, {self.servo.id: torque.to_bytes(0)})
             raise
         if present is None:
             late = f"{where}, and does not come inside in {way.bound_s:.1f} s"
