@@ -140,3 +140,12 @@ def test_a_changed_id_is_answered_under_the_old_one_and_two_of_one_id_talk_over_
     assert [p.servo for p in host.ask(9, dxl2.PING)] == [9] and host.write(2, "id", 1) == 0
     both = host.replies(1, dxl2.READ, POSITIONS)
     assert len(both) == 1 and maybe_packet(bytearray(both[0].data)) is None  # 2001 and 2002 at once: the crc is wrong
+
+
+def test_watchdog_is_fed_by_any_instruction(host):
+    host.write(1, "torque_enable", 1)
+    host.write(1, "bus_watchdog", 5)
+    for k in range(20):
+        host.t = 0.09 * k
+        host.ask(2, dxl2.PING)
+    assert host.read(1, "bus_watchdog") == 5

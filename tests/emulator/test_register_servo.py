@@ -1,5 +1,7 @@
 """One emulated servo, read and written directly: what its registers do."""
 
+import math
+
 import pytest
 from emulated_devices import ServoBench
 from hypothesis import given
@@ -180,3 +182,21 @@ def test_held_load_makes_it_warm_and_too_much_overheats_it():
     assert 33 < warm < 70
     bench.t = 120.0
     assert bench.get("hardware_error_status") & 1 << 2 and bench.get("torque_enable") == 0
+
+
+def test_indirect_data_write_through():
+    bench = ServoBench()
+    bench.put(indirect_address_1=65, indirect_address_2=84, indirect_address_3=85)
+    assert bench.servo.write(bench.table["indirect_data_1"].address, bytes([1, 0xBC, 2]), 0.0) == 0
+    assert (bench.get("led"), bench.get("position_p_gain")) == (1, 0x2BC)
+    # Half a register is refused, and then nothing at all is changed.
+    bench.put(indirect_address_3=86)
+    assert bench.servo.write(bench.table["indirect_data_1"].address, bytes([0, 1, 1]), 0.0) != 0
+    assert bench.get("led") == 1
+
+
+def test_position_stays_finite_at_the_ends_of_every_range():
+    bench = ServoBench(operating_mode=4)
+    bench.put(torque_enable=1, profile_velocity=32767, profile_acceleration=32767, goal_position=-1048575)
+    for _ in range(20):
+        assert math.isfinite(bench.after(1.0))
