@@ -202,8 +202,7 @@ class GazeTarget:
         if state is None:
             still = HeadTurn(np.zeros((3, 2)), np.zeros(2), now_s, HEAD_RATE)
             gaze = Jump.between(np.zeros(2), np.zeros(2), now_s)
-            left = self._stay(1, False)
-            state = AimState(now_s=now_s, gaze=gaze, head=still, head_before=still, left=left)
+            state = AimState(now_s=now_s, gaze=gaze, head=still, head_before=still, left=self._stay(1, False))
         gone = watched.seen_s is not None and now_s - watched.seen_s > GONE_S
         state = self._located(watched, now_s, state)
         state = self._counted(motion[0], now_s - state.now_s, watched, state)
@@ -217,8 +216,7 @@ class GazeTarget:
 
     def remember(self, now_s: float, pose: Doubles, state: AimState) -> AimState:
         """Return the state with the pose (6,) that the neck shows at `now_s`: a camera on it sees from there."""
-        kept = tuple(each for each in state.shown if now_s - each[0] <= 0.5)
-        return replace(state, shown=(*kept, (now_s, pose)))
+        return replace(state, shown=(*(each for each in state.shown if now_s - each[0] <= 0.5), (now_s, pose)))
 
     def _located(self, watched: Watched, now_s: float, state: AimState) -> AimState:
         """Return the state with the newest sighting and the direction to the person after it."""
@@ -231,7 +229,7 @@ class GazeTarget:
             return state
         poses = [pose for time_s, pose in state.shown if time_s <= seen_s + 1e-9] or [np.zeros(6)]
         there = direction_to(self.camera.to_base(watched.place_m, poses[-1]))
-        near = tuple(each for each in state.seen if seen_s - each[0] <= MEDIAN_S)
+        near = (each for each in state.seen if seen_s - each[0] <= MEDIAN_S)
         seen = (*near, (seen_s, np.clip(there, -FARTHEST_RAD, FARTHEST_RAD)))
         median_rad = np.median([direction for _, direction in seen], axis=0)
         moved = math.dist(median_rad, state.person_rad) > DEAD_ZONE_RAD
@@ -332,13 +330,12 @@ class GazeHold:
         motion: Floats,
         times_s: Doubles,
         state: HoldState | None,
-        shown_pose: ShownPose | None = None,
-        aim: Aim | None = None,
+        shown_pose: ShownPose,
+        aim: Aim | None,
     ) -> tuple[Floats, HoldState]:
         """Return motion (N, 58) at (N,) instants with new eyes; `state` None begins by holding the present gaze.
 
-        `shown_pose` None: the neck shows the requested pose. `aim`: added to the held direction; the head turns by its
-        part.
+        `aim`: added to the held direction; the head turns by its part.
         """
         both_rad = directions(motion, self.full_rad)  # (N, eye, axis)
         eyes_rad = 0.5 * (both_rad[:, 0] + both_rad[:, 1])
@@ -356,9 +353,9 @@ class GazeHold:
         turn(out, (held_rad - head_rad)[:, None] + apart_rad, self.full_rad)
         return out, state
 
-    def _head(self, motion: Floats, times_s: Doubles, shown_pose: ShownPose | None) -> Doubles:
+    def _head(self, motion: Floats, times_s: Doubles, shown_pose: ShownPose) -> Doubles:
         """Return yaw and pitch (N, 2) that the eyes take back. Joints share leads: each instant is solved once."""
-        if shown_pose is None or self._gain == 0:
+        if self._gain == 0:
             pose: Floats | Doubles = motion
         else:
             _, first, which = np.unique(times_s, return_index=True, return_inverse=True)

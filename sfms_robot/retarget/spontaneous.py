@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfms_robot.config import CameraMount, Gaze, Idle, Life
-from sfms_robot.frames import BLINKS, CHANNEL_INDEX, POSE, Doubles, Floats
+from sfms_robot.frames import BLINKS, CHANNEL_INDEX, Doubles, Floats
 from sfms_robot.ports import Watched
 from sfms_robot.retarget.gaze import AimState, GazeHold, GazeTarget, HoldState, ShownPose, turned
 from sfms_robot.signals.gaze_kinematics import Jump, directions, turn
@@ -197,19 +197,18 @@ class HeadLife:
         times_s: Doubles,
         now_s: float,
         state: LifeState,
-        shown_pose: ShownPose | None = None,
-        watched: Watched | None = None,
+        shown_pose: ShownPose,
+        watched: Watched,
     ) -> tuple[Floats, LifeState]:
         """Return motion (N, 58) at (N,) instants, row 0 at `now_s`, with spontaneous motion. Never changes its input.
 
-        `shown_pose`: motion (N, 58) -> the pose (N, 6) that the neck will show; None: the requested one.
-        `watched` None: no person, so no looks at or away from one.
+        `shown_pose`: motion (N, 58) -> the pose (N, 6) that the neck will show.
         """
         gaze, idle, aim_state, aim = state.gaze, state.idle, state.aim, None
         if self._idle:
             idle = self._idle.watch(motion, times_s, now_s, idle)
             motion = self._idle.sway(motion, times_s, idle)
-        if self._target and watched is not None:
+        if self._target:
             aim, aim_state = self._target.step(motion, times_s, now_s, watched, aim_state)
         if self._gaze:
             motion, gaze = self._gaze.step(motion, times_s, gaze, shown_pose, aim)
@@ -218,6 +217,5 @@ class HeadLife:
         if self._idle and idle:
             motion = self._idle.look(motion, times_s, idle)
         if self._target and aim_state and self._target.camera and self._target.camera.on_head:
-            shown = shown_pose(motion[:1])[0] if shown_pose else motion[0, POSE].astype(np.float64)
-            aim_state = self._target.remember(now_s, shown, aim_state)
+            aim_state = self._target.remember(now_s, shown_pose(motion[:1])[0], aim_state)
         return motion, LifeState(gaze, idle, aim_state)

@@ -3,12 +3,14 @@
 import numpy as np
 
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
+from sfms_robot.ports import Watched
 from sfms_robot.retarget.spontaneous import HeadLife, LifeState
 from sfms_robot.signals.gaze_kinematics import directions
 
 TICK_S, LEADS_S = 0.01, np.array([0.0, 0.05, 0.08])
 FULL_RAD = np.radians([30.0, 20.0])
 YAW, PITCH = CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]
+NOBODY = Watched()
 
 
 def still(t):
@@ -25,8 +27,8 @@ def lived(life, seconds, listener=still, watched=None, seed=0, camera=None, tick
     for now_s in tick_s * np.arange(round(seconds / tick_s)):
         times_s = now_s + LEADS_S
         asked = np.stack([listener(t) for t in times_s])
-        person = {} if watched is None else {"watched": watched(now_s, shown)}
-        motion, state = alive.step(asked, times_s, now_s, state, **person)
+        person = NOBODY if watched is None else watched(now_s, shown)
+        motion, state = alive.step(asked, times_s, now_s, state, lambda face: face[..., :6], person)
         shown.append(motion)
     return np.array(shown)
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from life_rig import LEADS_S, PITCH, YAW, lived, still
+from life_rig import LEADS_S, NOBODY, PITCH, YAW, lived, still
 
 from sfms_robot.config import Idle, Life
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM
@@ -36,7 +36,7 @@ def blinks(shown) -> int:
 def test_with_everything_left_out_or_at_zero_the_face_is_the_same_and_the_input_never_changes():
     alive = spontaneous.HeadLife(Life(), seed=0)
     motion = np.random.default_rng(0).uniform(0, 1, (3, MOTION_DIM)).astype(np.float32)
-    assert alive.step(motion, LEADS_S, 0.0, spontaneous.LifeState())[0] is motion
+    assert alive.step(motion, LEADS_S, 0.0, spontaneous.LifeState(), np.asarray, NOBODY)[0] is motion
     motion = np.random.default_rng(0).uniform(0, 1, MOTION_DIM).astype(np.float32)
     shown = idled(lambda t: motion, 10.0, blinks_per_minute=0, head_deg=0, glance_deg=0)
     others = [i for i in range(MOTION_DIM) if not 16 <= i < 24]  # eye channels that pull both ways are evened out
@@ -45,7 +45,7 @@ def test_with_everything_left_out_or_at_zero_the_face_is_the_same_and_the_input_
     alive = spontaneous.HeadLife(Life(idle=Idle()), seed=0)
     state = spontaneous.LifeState()
     for now_s in np.arange(0, 20, TICK_S):
-        _, state = alive.step(motion, now_s + LEADS_S, now_s, state)
+        _, state = alive.step(motion, now_s + LEADS_S, now_s, state, np.asarray, NOBODY)
     assert not motion.any()
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from life_rig import FULL_RAD
+from life_rig import FULL_RAD, NOBODY
 
 from sfms_robot.config import Gaze, Life, load_head
 from sfms_robot.config.head import held_back
@@ -16,7 +16,7 @@ from sfms_robot.signals.gaze_kinematics import directions
 from sfms_robot.signals.rotations import rotation
 
 HEADS = {name: load_head(name) for name in head_names()}
-HEADS |= {f"{name}, cautious": held_back(head) for name, head in list(HEADS.items())}
+HEADS |= {f"{name}, cautious": held_back(head, head.joints) for name, head in list(HEADS.items())}
 RECENTRE_DEG = 400.0  # they never jump back to where the face has them
 RETARGETERS = {name: HeadRetargeter(head) for name, head in HEADS.items() if head.kinematics}
 
@@ -61,7 +61,7 @@ def test_the_gaze_of_the_head_that_is_shown_stands_still(name, intensity, style,
         times_s = now_s + np.array([0.0, 0.05])
         motion = np.zeros((2, MOTION_DIM), np.float32)
         motion[:, :6] = np.sin(2 * np.pi * hz * times_s)[:, None] * [*turn, *shift]
-        motion, state = alive.step(motion, times_s, now_s, state, lambda face: retargeter.shown_pose(face, knobs))
+        motion, state = alive.step(motion, times_s, now_s, state, lambda f: retargeter.shown_pose(f, knobs), NOBODY)
         rows.append(motion[0])
     motion = np.array(rows)
     solved = np.array([retargeter.angles(row, knobs)[retargeter.neck_columns] for row in motion])
