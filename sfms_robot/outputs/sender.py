@@ -1,8 +1,8 @@
 """Motion on its way to an output: eased, limited, in a thread of its own, over losses of the peer.
 
     MotionShaper    motion that an output shows, a value passed from step to step: no jump at start, end, halt, return
-    OutputSender    one output: connect, shape, send, and connect again after a loss; time is an argument
-    OutputThread    the same in a thread, at its rate; takes the newest tick of the loop, which never waits
+    OutputSender    one output: connect, shape, send, and connect again after a loss; time is an argument of its `step`,
+                    which its thread calls at the output's rate with the newest tick of the loop, which never waits
     Outputs         all of a run
 
     phase        motion goes to                     when
@@ -80,7 +80,6 @@ class MotionShaper:
 
     def start(self, now_s: float) -> Shown:
         """Return neutral."""
-        limiter = None if self._limiter is None else self._limiter.start(np.zeros(len(self._columns)))
         return Shown(
             motion=NEUTRAL,
             phase="neutral",
@@ -88,7 +87,7 @@ class MotionShaper:
             origin=NEUTRAL,
             before=NEUTRAL,
             here=NEUTRAL,
-            limiter=limiter,
+            limiter=None if self._limiter is None else self._limiter.start(np.zeros(len(self._columns))),
         )
 
     def step(self, target: Floats, phase: Phase, now_s: float, shown: Shown) -> Shown:
@@ -114,15 +113,17 @@ class MotionShaper:
 
 
 class OutputSender:
-    """One output without its thread: `step` connects or sends, once a period.
+    """One output: `step` connects or sends, once a period. `joints`: of `Tick.goals_rad`.
 
     Attributes:
         name: KIND:ADDRESS, in messages and in `why` of a degraded run.
         lost: the peer is away.
         shown: what it shows; None while it is not connected.
+        thread: calls `step` with the newest tick, once it is started.
+        closing: set to end the thread: it eases to neutral and disconnects.
     """
 
-    def __init__(self, output: Output) -> None:
+    def __init__(self, output: Output, joints: Sequence[str] = ()) -> None:
         self.output = output
         self.name = f"{output.kind}:{output.peer}"
         self.lost = False
@@ -132,6 +133,11 @@ class OutputSender:
         self._problem: str | None = None
         self._counts = {"frames": 0, "losses": 0}
         self._window = (0.0, 0, 0.0)  # begins, frames by then, frames a second of the one before
+        self._joints = tuple(joints)
+        self._tick: Tick | None = None
+        self._events = deque[ListenerEvent](maxlen=_MOST_EVENTS)
+        self.closing = threading.Event()
+        self.thread = threading.Thread(target=self._work, name=f"output {output.kind}", daemon=True)
 
     @property
     def settled(self) -> bool:
@@ -210,22 +216,6 @@ class OutputSender:
         self._retry_s = now_s + self._pause_s
         self._pause_s = min(2 * self._pause_s, PAUSES_S[1])
 
-
-class OutputThread(OutputSender):
-    """An output in its thread: sends the newest tick at the output's rate. `joints`: of `Tick.goals_rad`."""
-
-    def __init__(self, output: Output, joints: Sequence[str] = ()) -> None:
-        super().__init__(output)
-        self._joints = tuple(joints)
-        self._tick: Tick | None = None
-        self._events: deque[ListenerEvent] = deque(maxlen=_MOST_EVENTS)
-        self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._work, name=f"output {output.kind}", daemon=True)
-
-    def start(self) -> None:
-        """Start to connect."""
-        self._thread.start()
-
     def tick(self, seen: Tick) -> None:
         self._tick = seen
 
@@ -248,18 +238,10 @@ class OutputThread(OutputSender):
             joints=self._joints,
         )
 
-    def end(self) -> None:
-        """Begin to end: ease to neutral, disconnect. Returns at once; `join` waits."""
-        self._closing.set()
-
-    def join(self, limit_s: float) -> None:
-        """Wait for the end, after `start` and `end`."""
-        self._thread.join(limit_s)
-
     def _work(self) -> None:
         period_s = 1.0 / self.output.rate_hz
         due_s = time.monotonic()
-        while not self._closing.wait(max(0.0, due_s - time.monotonic())):
+        while not self.closing.wait(max(0.0, due_s - time.monotonic())):
             now_s = time.monotonic()
             self.step(self.frame(), now_s)
             due_s = max(due_s + period_s, now_s + period_s / 2)  # after a late frame the others are not made up for
@@ -278,33 +260,33 @@ class Outputs(Observer):
     """
 
     def __init__(self, outputs: Sequence[Output], joints: Sequence[str] = ()) -> None:
-        self.threads = [OutputThread(output, joints) for output in outputs]
-        self.names = tuple(each.name for each in self.threads)
-        for thread in self.threads:
-            thread.start()
+        self.senders = [OutputSender(output, joints) for output in outputs]
+        self.names = tuple(each.name for each in self.senders)
+        for each in self.senders:
+            each.thread.start()
 
     @property
     def missing(self) -> tuple[str, ...]:
         """Names of outputs whose peer is away."""
-        return tuple(each.name for each in self.threads if each.lost)
+        return tuple(each.name for each in self.senders if each.lost)
 
     def tick(self, seen: Tick) -> None:
-        for thread in self.threads:
-            thread.tick(seen)
+        for each in self.senders:
+            each.tick(seen)
 
     def event(self, event: ListenerEvent) -> None:
         """Take an event that the listener has decided. From any thread."""
-        for thread in self.threads:
-            thread.event(event)
+        for each in self.senders:
+            each.event(event)
 
     def statistics(self) -> list[Facts]:
         """Return the figures of each output, as `OutputSender.statistics`."""
-        return [thread.statistics() for thread in self.threads]
+        return [each.statistics() for each in self.senders]
 
     def close(self) -> None:
         """Lead all outputs to neutral and disconnect them, side by side. Blocks `LAST_S` at most. Idempotent."""
-        for thread in self.threads:
-            thread.end()
+        for each in self.senders:
+            each.closing.set()
         until_s = time.monotonic() + LAST_S
-        for thread in self.threads:
-            thread.join(max(0.0, until_s - time.monotonic()))
+        for each in self.senders:
+            each.thread.join(max(0.0, until_s - time.monotonic()))

@@ -8,7 +8,7 @@ import pytest
 from sfms_robot.errors import ConfigError, OutputError
 from sfms_robot.frames import CHANNEL_INDEX, MOTION_DIM, ListenerEvent
 from sfms_robot.outputs.registry import open_output, parse_address
-from sfms_robot.outputs.sender import EASE_S, Outputs, OutputSender, OutputThread
+from sfms_robot.outputs.sender import EASE_S, Outputs, OutputSender
 from sfms_robot.ports import ChannelLimit, Output, OutputFrame, Tick
 
 HZ = 50.0
@@ -146,18 +146,18 @@ def test_a_plug_in_that_raises_elsewhere_ends_nothing():
     assert sender.statistics()["state"] == "lost"
 
 
-def test_a_thread_hands_over_the_newest_tick_and_the_events_that_have_begun():
-    thread = OutputThread(Peer(), ["neck"])
-    assert thread.frame() is None
+def test_a_sender_hands_over_the_newest_tick_and_the_events_that_have_begun():
+    sender = OutputSender(Peer(), ["neck"])
+    assert sender.frame() is None
     for start_s in (0.1, 0.5):
-        thread.event(ListenerEvent("nod", start_s, 0.5, 0.2))
+        sender.event(ListenerEvent("nod", start_s, 0.5, 0.2))
     for time_s in (0.1, 0.2):
-        thread.tick(Tick(time_s, looking().motion, np.ones(1), {}, "listening"))
-    frame = thread.frame()
+        sender.tick(Tick(time_s, looking().motion, np.ones(1), {}, "listening"))
+    frame = sender.frame()
     assert (frame.time_s, frame.joints, [each.start_s for each in frame.events]) == (0.2, ("neck",), [0.1])
-    assert thread.frame().events == ()
-    thread.tick(Tick(0.5, looking().motion, np.ones(1), {}, "listening"))
-    assert [each.start_s for each in thread.frame().events] == [0.5]
+    assert sender.frame().events == ()
+    sender.tick(Tick(0.5, looking().motion, np.ones(1), {}, "listening"))
+    assert [each.start_s for each in sender.frame().events] == [0.5]
 
 
 def test_outputs_connect_send_and_end_in_threads_of_their_own():
