@@ -24,7 +24,7 @@ from sfms_robot.sources.registry import BROWSER, check_source, split_kind
 if TYPE_CHECKING:
     from sfms_robot.config import Calmness
     from sfms_robot.listeners.engine import EngineName
-    from sfms_robot.listeners.remote import NamedFeed
+    from sfms_robot.ports import PlanFeed
     from sfms_robot.runtime.recorder import RecordFormat
     from sfms_robot.viewer.page_process import PageProcess
 
@@ -185,7 +185,7 @@ def calmed(per_minute: Sequence[str], addressed: str) -> Calmness:
     return parse(Calmness, {**rates, "addressed": addressed}, "--calmness, --addressed")
 
 
-def begin_listening(options: RunOptions) -> NamedFeed:
+def begin_listening(options: RunOptions) -> PlanFeed:
     """Return the listener, which loads or connects from now on, for `session.run(feed=...)`. The caller closes it.
 
     One on another machine chooses its engine itself. Raises ConfigError, MissingExtra.

@@ -32,7 +32,6 @@ from typing import TYPE_CHECKING, Any, Final
 from sfms_robot.config.listener import Calmness
 from sfms_robot.errors import ConfigError, PacketError
 from sfms_robot.frames import ListenerEvent, Plan, SpeakerFrame
-from sfms_robot.listeners.process import ListenerProcess
 from sfms_robot.listeners.remote_messages import (
     OURS,
     Join,
@@ -346,6 +345,3 @@ class ZenohLink:
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
         self._received.append((time.monotonic(), sample.payload.to_bytes()))
-
-
-NamedFeed = ListenerProcess | RemoteListener  # of a run whose listener has a name

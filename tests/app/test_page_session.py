@@ -19,7 +19,7 @@ from sfms_robot.runtime.safety import Interrupt
 
 def test_a_run_that_a_visitor_has_left_is_asked_to_end():
     page, interrupt = SimpleNamespace(visitors=1), Interrupt()
-    alone = EndsAlone(page, interrupt)
+    alone = EndsAlone(page=page, interrupt=interrupt, left_s=LEFT_S)
     alone.tick(SimpleNamespace(time_s=40.0))
     page.visitors = 0
     alone.tick(SimpleNamespace(time_s=40.0 + LEFT_S))

@@ -12,7 +12,7 @@ import math
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -28,8 +28,7 @@ from sfms_robot.config import load_head
 from sfms_robot.data import Report, listener_names, speaker_names
 from sfms_robot.errors import NOTE, InputError
 from sfms_robot.frames import NEUTRAL
-from sfms_robot.listeners.remote import NamedFeed
-from sfms_robot.ports import Facts, Observer, Tick
+from sfms_robot.ports import Facts, Observer, PlanFeed, Tick
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.net_person import PageVisitor
 from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER
@@ -72,7 +71,7 @@ class PageSession:
         page.answered_by(self)
 
     def run(
-        self, panel: session.Panel | None = None, feed: NamedFeed | None = None, observers: Sequence[Observer] = ()
+        self, panel: session.Panel | None = None, feed: PlanFeed | None = None, observers: Sequence[Observer] = ()
     ) -> Report:
         """Run once, with `options`. Blocks until it is over; returns its report. Raises as `session.run`.
 
@@ -103,8 +102,8 @@ class PageSession:
             stack.callback(self.recorder.close)
             self.reach = controls
             stack.callback(self._ended)
-            lonely = EndsAlone(self.page, controls.interrupt, LEFT_S if by_visitor else AWAY_S)
-            watchers: list[Observer] = [watcher, self.recorder, *observers]
+            lonely = EndsAlone(page=self.page, interrupt=controls.interrupt, left_s=LEFT_S if by_visitor else AWAY_S)
+            watchers = [watcher, self.recorder, *observers]
             if self._choices and (by_visitor or self._further):  # only visitors keep it running
                 watchers.append(lonely)
             report = session.run(
@@ -215,25 +214,28 @@ class PageSession:
             self.reach.interrupt.ask()
 
 
+@dataclass(kw_only=True, eq=False)
 class EndsAlone(Observer):
     """Ends a run that has had no visitors for `left_s`.
 
     Attributes:
         ended: it has done so.
+        seen_s: time of the last visitor.
     """
 
-    def __init__(self, page: PageProcess, interrupt: Interrupt, left_s: float = LEFT_S) -> None:
-        self._page, self._interrupt, self._left_s = page, interrupt, left_s
-        self.ended = False
-        self._seen_s = 0.0
+    page: PageProcess
+    interrupt: Interrupt
+    left_s: float
+    ended: bool = False
+    seen_s: float = 0.0
 
     def tick(self, seen: Tick) -> None:
         """Count the time without visitors."""
-        if self._page.visitors or self._interrupt():
-            self._seen_s = seen.time_s
-        elif seen.time_s - self._seen_s > self._left_s:
+        if self.page.visitors or self.interrupt():
+            self.seen_s = seen.time_s
+        elif seen.time_s - self.seen_s > self.left_s:
             self.ended = True
-            self._interrupt.ask()
+            self.interrupt.ask()
 
 
 def stay_for_visitors(page: PageProcess, over: threading.Event, longest_s: float = math.inf) -> None:
