@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sfms_robot.app.open_head import build_bus, build_motion
+from sfms_robot.app.open_head import build_bus, build_motion, run_log
 from sfms_robot.config import Head
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, MOTION_DIM, Plan, SpeakerFrame
@@ -44,11 +44,8 @@ def driven(
 ) -> tuple[str, RunLog]:  # fmt: skip
     """Drive a head to the end; `parts` replace those of `build_motion`."""
     motion = build_motion(head, rate_hz)
-    log = log or RunLog(joints=list(head.joints), period_s=1 / rate_hz, audit=motion.audit)
-    whole = {
-        "timeline": motion.timeline, "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus,
-        "observers": [observer], "leads_s": motion.leads_s, "rest_rad": motion.rest_rad,
-    }  # fmt: skip
+    log = log or run_log(head, rate_hz)
+    whole = {**vars(motion), "holds": None, "heat": None, "bus": bus, "observers": [observer]}
     outcome = drive(Parts(**whole | parts), clock, log, rate_hz=rate_hz, duration_s=duration_s, interrupted=interrupted)
     return outcome, log
 

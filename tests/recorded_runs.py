@@ -12,7 +12,7 @@ JOINTS = ("neck_pitch", "jaw", "brow")
 def record(folder, seconds=2.0, voice=True, record_format="json"):
     """A run at 100 Hz: the speaker talks in the first half."""
     about = {"head": "face28", "seed": "3"}
-    recorder = Recorder(folder, JOINTS, when_full="wait", about=about, record_format=record_format)
+    recorder = Recorder(folder, JOINTS, wait=True, about=about, record_format=record_format)
     rng = np.random.default_rng(0)
     for n in range(round(seconds * 100)):
         time_s = n / 100

@@ -2,7 +2,8 @@
 
     prepare_head    what can be checked before anything is opened: the head's file, its ports, what is confirmed
     calibrated_head the head's file with the overlay of this build, for the servos that answer
-    build_motion    the parts between a plan and the bus: timeline, retargeter, limiter, audit, heat
+    build_motion    the parts between a plan and the bus: timeline, retargeter, limiter, heat
+    run_log         the figures of a run, with the audit of its commands
     build_bus       every servo of the head behind one bus, emulated ones and real ones alike
     open_head       all of them: emulated servos started, ports opened, every servo identified; torque is untouched
 
@@ -30,7 +31,6 @@ from sfms_robot.config.overlay import Identity, head_hash, layered, load_overlay
 from sfms_robot.data import NO_HEAD, Report
 from sfms_robot.emulator.launch import Chain
 from sfms_robot.errors import ConfigError, ServoError
-from sfms_robot.frames import Bools, Doubles
 from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.motion.calibration import Calibration
 from sfms_robot.motion.limits import JerkLimiter, JointLimits
@@ -38,6 +38,8 @@ from sfms_robot.motion.timeline import PlanTimeline
 from sfms_robot.ports import Bus, Clock
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.runtime.clock import RealClock, VirtualClock
+from sfms_robot.runtime.log import RunLog
+from sfms_robot.runtime.loop import Motion
 from sfms_robot.runtime.safety import HeatGuard
 from sfms_robot.servo.bus import LEFT_OUT, AbsentBus
 from sfms_robot.servo.composite import CompositeBus
@@ -52,20 +54,6 @@ log = logging.getLogger(__name__)
 
 _REVERSED: Final = 1  # bit of the drive mode: the direction in which ticks rise
 NO_BUS_HZ: Final = 50.0  # rate of the loop of a head without servos
-
-
-@dataclass(frozen=True, kw_only=True)
-class Motion:
-    """The parts between a plan and the bus. `holds` (J,): joints that keep their torque in an emergency stop."""
-
-    timeline: PlanTimeline
-    retargeter: HeadRetargeter
-    limiter: JerkLimiter
-    audit: CommandAudit
-    leads_s: Doubles
-    rest_rad: Doubles
-    holds: Bools
-    heat: HeatGuard
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,7 +237,6 @@ def _identity(wire: Wire, joint: Joint) -> Identity | None:
 
 def build_motion(head: Head, rate_hz: float) -> Motion:
     """Build the parts for a loop at `rate_hz`, the rate of the head's fastest bus."""
-    limits = JointLimits.of(head)
     retargeter = HeadRetargeter(head, 1.0 / rate_hz)
     leads_s = np.array([joint.lag_ms / 1e3 for joint in head.joints.values()])
     if len(neck := retargeter.neck_columns):
@@ -260,8 +247,7 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
     return Motion(
         timeline=PlanTimeline(1.0 / rate_hz),
         retargeter=retargeter,
-        limiter=JerkLimiter(limits, 1.0 / rate_hz),
-        audit=CommandAudit(limits, calibration_of(head.joints), 1.0 / rate_hz),
+        limiter=JerkLimiter(JointLimits.of(head), 1.0 / rate_hz),
         leads_s=leads_s,
         rest_rad=head.rest_rad,
         holds=holds,
@@ -269,6 +255,12 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
             np.array([each.warm_C for each in safety]), np.array([each.hot_C for each in safety]), neck.tolist()
         ),
     )
+
+
+def run_log(head: Head, rate_hz: float) -> RunLog:
+    """Return an empty log for `session.drive_head`, which audits commands by the head's limits."""
+    audit = CommandAudit(JointLimits.of(head), calibration_of(head.joints), 1.0 / rate_hz)
+    return RunLog(joints=list(head.joints), period_s=1.0 / rate_hz, audit=audit)
 
 
 def build_bus(
@@ -376,7 +368,7 @@ def check_safety(head: Head, joints: Mapping[str, Joint]) -> None:
 def _check_limits(head: Head, name: str, table: FirmwareMap) -> None:
     safety, joint, registers = head.safety_of(name), head.joints[name], Table.of(table)
     limits_torque = torque_register(registers) is not None
-    impossible: dict[str, tuple[float | None, str]] = {}
+    impossible = {}
     if "goal_current" not in table.registers:
         instead = "; torque_limit_percent limits its torque" if limits_torque else ""
         impossible["current_limit_mA"] = safety.current_limit_mA, f"cannot limit its current{instead}"

@@ -13,7 +13,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -22,13 +22,12 @@ from typing import Any, Final
 from sfms_robot.app.listen.knobs import RunControls
 from sfms_robot.app.listen.report import (
     OutletObserver,
-    event_watch,
     figures_so_far,
     limitation,
     run_facts,
     run_report,
 )
-from sfms_robot.app.open_head import OpenHead, open_head, prepare_head
+from sfms_robot.app.open_head import OpenHead, open_head, prepare_head, run_log
 from sfms_robot.app.options import RunOptions, begin_listening
 from sfms_robot.data import Report
 from sfms_robot.endpoint import leads_here
@@ -44,6 +43,7 @@ from sfms_robot.runtime.halt import halt_signals, halt_switch
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.loop import Parts, drive
 from sfms_robot.runtime.observers import NotifyingObserver, RunStatus, ServiceManager
+from sfms_robot.runtime.planned_events import EventWatch
 from sfms_robot.runtime.recorder import Recorder, check_folder, write_report
 from sfms_robot.runtime.safety import Interrupt, signals_to
 from sfms_robot.sources.registry import open_source, split_kind
@@ -58,16 +58,10 @@ Panel = Callable[[RunControls], AbstractContextManager[object]]
 # --- any motion on a head -------------------------------------------------------------------------------------------
 
 
-def run_log(opened: OpenHead) -> RunLog:
-    """Return an empty log for `drive_head`."""
-    return RunLog(joints=opened.motion.retargeter.joints, period_s=1.0 / opened.rate_hz, audit=opened.motion.audit)
-
-
 def run_parts(opened: OpenHead, source: Source, feed: PlanFeed, **more: Any) -> Parts:
     """Return the parts of a run on an open head: a person and a listener; `more` replaces parts of the head's own."""
-    own = {key: part for key, part in vars(opened.motion).items() if key != "audit"}  # names of `Parts` all
-    own |= {"bus": opened.bus, "observers": (), "ignored": frozenset(opened.options.without), **more}
-    return Parts(source=source, feed=feed, **own)
+    own = {"bus": opened.bus, "observers": (), "ignored": frozenset(opened.options.without)}
+    return Parts(source=source, feed=feed, **vars(opened.motion) | own | more)
 
 
 def drive_head(
@@ -87,7 +81,7 @@ def drive_head(
         duration_s: None without an end.
         log: is filled; other threads may read it meanwhile.
     """
-    log = log or run_log(opened)
+    log = log or run_log(opened.config, opened.rate_hz)
     real = not opened.options.fast
     outcome, error = "failed", None
     watched = parts.halt.watched(opened.bus) if real else nullcontext()
@@ -172,32 +166,30 @@ def run(
         opened, person, feed = _open(options, controls, source, feed, stack)
         if feed is None:
             return {"version": 1, **facts, "exit": "done", "readings": opened.readings()}
-        log, joints = run_log(opened), list(opened.config.joints)
-        outputs = None
-        if sinks:
-            from sfms_robot.outputs.sender import Outputs
+        log, joints = run_log(opened.config, opened.rate_hz), list(opened.config.joints)
+        from sfms_robot.outputs.sender import Outputs
 
-            outputs = stack.enter_context(closing(Outputs(sinks, joints)))
+        outputs = stack.enter_context(closing(Outputs(sinks, joints)))
         duration_s = person.duration_s if options.duration_s is None else options.duration_s
         figures = partial(figures_so_far, opened, log, person, feed, knobs, outputs, more)
         status = RunStatus(joints, {**facts, "duration_s": duration_s}, figures)
         controls.document = status.document
-        watchers: list[Observer] = [status, *observers]
+        watchers = [status, *observers]
 
         def watch(observer: Observer) -> None:
             watchers.append(stack.enter_context(closing(observer)))
 
-        if outputs is not None:
+        if sinks:
             log.reported = outputs.names
             watchers.append(outputs)
-            watch(event_watch(outputs.event))
+            watch(EventWatch(outputs.event))
         recorder = None
         if options.record is not None:
             recorder = Recorder(
                 options.record,
                 joints,
-                "wait" if options.fast else "drop",
                 run_facts(opened.config, options),
+                wait=options.fast,
                 record_format=options.record_format,
             )
             watch(recorder)
@@ -219,15 +211,13 @@ def run(
             played = {"life": HeadLife(head.life, options.seed, head.camera), "answers": True}
         parts = run_parts(
             opened, person, feed, knobs=lambda: knobs.now, overlay=controls.puppet.overlay, halt=halt,
-            observers=watchers, missing=(lambda: outputs.missing) if outputs else tuple, **played,
+            observers=watchers, missing=lambda: outputs.missing, **played,
         )  # fmt: skip
         report = drive_head(opened, parts, interrupt, duration_s=duration_s, log=log)
         status.ended(log.states[-1][1])
-        if outputs is not None:
-            outputs.close()
+        outputs.close()
         report |= {"listener": facts["listener"], "seed": options.seed, "source": dict(person.statistics())}
-        report |= {"limitation": limited, **more()}
-        report["outputs"] = [] if outputs is None else outputs.statistics()
+        report |= {"limitation": limited, **more(), "outputs": outputs.statistics()}
         report |= {"wire": opened.digests()} if options.fast else {}
         if recorder is not None:
             recorder.close()
@@ -292,10 +282,7 @@ def _open(
     if feed is None and not options.dry_run:
         feed = _feed(replace(options, calmness=controls.calmness), stack)
     controls.set_rates = getattr(feed, "calm", None)
-    opening: Future[Source] = Future()
-    if source is not None:
-        opening.set_result(source)
-    else:  # in a thread: a microphone takes a second, and so does the head
+    if source is None:  # in a thread: a microphone takes a second, and so does the head
         worker = ThreadPoolExecutor(1, "source")
         opening = worker.submit(
             open_source,
@@ -311,7 +298,7 @@ def _open(
         worker.shutdown(wait=False)
         stack.callback(lambda: None if opening.exception() else opening.result().close())
     opened = stack.enter_context(open_head(options))
-    person = opening.result()
+    person = opening.result() if source is None else source
     if options.fast and options.duration_s is None and person.duration_s is None:
         raise ConfigError("--fast without a recording never ends: give it a --duration")
     if (wait_loaded := getattr(feed, "wait_loaded", None)) is not None:

@@ -15,7 +15,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from sfms_robot.data import Report
 from sfms_robot.frames import FRAME_S, Bools, Doubles, Floats, Plan, SpeakerFrame
 from sfms_robot.motion.audit import CommandAudit
 from sfms_robot.runtime.clock import TickPace, TickTime
@@ -98,7 +97,7 @@ class EventCounter:
 
 
 class RunLog:
-    """Figures filled by the loop and read at the end; `motion_so_far`, counters and quantiles also by other threads.
+    """Figures filled by the loop and read at the end; quantiles, and `so_far` of `counters`, also by other threads.
 
     `period_s`: of a tick.
     """
@@ -117,19 +116,19 @@ class RunLog:
         self.torque_unconfirmed: list[str] = []  # joints that came on and are not confirmed off
         self.detached: Mapping[str, str] = {}  # observers that raised
         self.reported: Sequence[str] = ()  # lost parts that log their own loss
-        self.states: deque[tuple[float, RunState]] = deque(maxlen=STATES)
+        self.states = deque[tuple[float, RunState]](maxlen=STATES)
         self.state_s = defaultdict[str, float](float)
         self._low_rad = np.full(len(joints), np.inf)  # (J,), as the two below
         self._high_rad = -self._low_rad
         self._travel_rad = np.zeros(len(joints))
         self._last_rad: Doubles | None = None
         self._worked_s = 0.0  # by the loop's thread so far
-        self._waiting: deque[Plan] = deque(maxlen=_REMEMBERED)
-        self._speech_s: deque[float] = deque(maxlen=_REMEMBERED)
+        self._waiting = deque[Plan](maxlen=_REMEMBERED)
+        self._speech_s = deque[float](maxlen=_REMEMBERED)
         worker = ThreadPoolExecutor(1, "event counter")
         worker.submit(int).result()  # its thread begins now, before the loop's takes real-time priority
         rate_hz = 1.0 / period_s
-        self._counters = {name: EventCounter(kind.find, rate_hz, worker) for name, kind in MOTION_EVENTS.items()}
+        self.counters = {name: EventCounter(kind.find, rate_hz, worker) for name, kind in MOTION_EVENTS.items()}
 
     def start(self, held_rad: Doubles) -> None:
         """Start the audit where torque came on, `held_rad` (J,)."""
@@ -166,15 +165,6 @@ class RunLog:
         before = self.states[-1][1] if self.states else RunState("stopping")
         self.entered(before.ended(now_s, None if error is None else str(error)), now_s)
 
-    def state_report(self) -> Report:
-        """Return `states` of the report: seconds in each, and the newest changes with their reasons."""
-        return {
-            "seconds": {name: round(seconds, 3) for name, seconds in self.state_s.items()},
-            "changes": [
-                {"time_s": round(at_s, 3), "state": state.name, "why": list(state.why)} for at_s, state in self.states
-            ],
-        }
-
     def planned(self, plan: Plan) -> None:
         self._waiting.append(plan)
 
@@ -201,7 +191,7 @@ class RunLog:
             return
         self.listened_s = tick.time_s
         for name, kind in MOTION_EVENTS.items():
-            self._counters[name].add(float(kind.signal(motion)))
+            self.counters[name].add(float(kind.signal(motion)))
 
     def wrote(self, wire_s: float, reach_s: float) -> None:
         """Record a command on the wire at `wire_s`, which played the timeline up to `reach_s`."""
@@ -216,25 +206,6 @@ class RunLog:
         """Return `attention` of the report: share of the judged frames in which the person looks at the head."""
         share = round(self.attentive_frames / self.judged_frames, 4) if self.judged_frames else None
         return {"share": share, "frames": self.judged_frames}
-
-    def motion_report(self) -> dict[str, int]:
-        """Return `motion` of the report."""
-        return {f"{name}s": counter.total() for name, counter in self._counters.items()}
-
-    def motion_so_far(self) -> dict[str, int]:
-        """Return the same during the run, as of the last call. From any thread."""
-        return {f"{name}s": counter.so_far for name, counter in self._counters.items()}
-
-    def tick_report(self, target_hz: float, elapsed_s: float | None) -> Report:
-        """Return `tick` of the report; wall-clock figures are null without a wall clock (`elapsed_s` None)."""
-        real = elapsed_s is not None
-        late_ms = self.late_ms if real else Quantiles()
-        return {
-            "target_hz": target_hz,
-            "achieved_hz": round(self.ticks / elapsed_s, 2) if elapsed_s else None,
-            "late": self.late if real else None,
-            "jitter_ms": late_ms.report(p50=50, p99=99, max=100),
-        }
 
     def joint_report(self) -> dict[str, dict[str, float]]:
         """Return `joints` of the report: range and travelled way of every goal stream."""

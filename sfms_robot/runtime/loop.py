@@ -41,37 +41,46 @@ _TURNING: Final = [CHANNEL_INDEX[name] for name in CHANNELS if name in ("yaw", "
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parts:
-    """The parts of a run, put together by `app`; (J,) in joint order.
+class Motion:
+    """The parts between a plan and the bus; (J,) in joint order.
 
     Attributes:
         leads_s, rest_rad: (J,).
+        holds: (J,) joints that keep their torque when halted; None: no joint does.
+        heat: temperature derating; None disables it.
+    """
+
+    timeline: Timeline
+    retargeter: Retargeter
+    limiter: JerkLimiter
+    leads_s: Doubles
+    rest_rad: Doubles
+    holds: Bools | None = None
+    heat: HeatGuard | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parts(Motion):
+    """The parts of a run, put together by `app`.
+
+    Attributes:
         knobs: called at every tick for the knobs of the head; None: those of its file.
         overlay: (motion (N, 58), times (N,)) -> motion adds the commands of a program to the plan.
         answers: the plan shows only while a person is there.
         halt: read at every tick.
-        holds: (J,) joints that keep their torque when halted; None: no joint does.
-        heat: temperature derating; None disables it.
         ignored: joints whose faults are known and accepted.
         missing: called at every tick for names of further lost parts.
     """
 
     source: Source
     feed: PlanFeed
-    timeline: Timeline
-    retargeter: Retargeter
-    limiter: JerkLimiter
     bus: Bus
     observers: Sequence[Observer]
-    leads_s: Doubles
-    rest_rad: Doubles
     life: HeadLife | None = None
     knobs: Callable[[], Any] | None = None
     overlay: Callable[[Floats, Doubles], Floats] | None = None
     answers: bool = False
     halt: HaltLatch = field(default_factory=HaltLatch)
-    holds: Bools | None = None
-    heat: HeatGuard | None = None
     ignored: frozenset[str] = frozenset()
     missing: Callable[[], Sequence[str]] = tuple
 

@@ -28,6 +28,8 @@ WINDOW: Final = 8 * FRAME_HZ  # frames that are searched; no nod is longer
 NEWS: Final = 2 * FRAME_HZ  # an event that ended more frames ago is not new: the edge of the window made it
 MOST_WAITING: Final = 10 * FRAME_HZ  # plans
 
+TakeEvent = Callable[[ListenerEvent], object]
+
 
 class PlannedEvents:
     """Detector of events in plans, with a memory of `WINDOW` frames."""
@@ -87,20 +89,26 @@ class EventWatch(Observer):
     Callbacks run one after the other. One that raises is detached and named; plans that wait for a slow one for longer
     than ten seconds are left out.
 
+    Args:
+        callback: called with events of every kind; None: `on` alone.
+
     Attributes:
         detached: callbacks that raised, and their errors.
     """
 
-    def __init__(self) -> None:
-        self._callbacks: list[tuple[str, Callable[[ListenerEvent], object]]] = []
-        self._plans: deque[Plan] = deque(maxlen=MOST_WAITING)
+    def __init__(self, callback: TakeEvent | None = None) -> None:
+        self._callbacks: list[tuple[str, TakeEvent]] = []
+        self._plans = deque[Plan](maxlen=MOST_WAITING)
         self._changed = threading.Condition()
         self._closing = False
         self._origin_s: float | None = None
         self._thread: threading.Thread | None = None
         self.detached: dict[str, str] = {}
+        if callback is not None:
+            for kind in EVENT_KINDS:
+                self.on(kind, callback)
 
-    def on(self, kind: str, callback: Callable[[ListenerEvent], object]) -> None:
+    def on(self, kind: str, callback: TakeEvent) -> None:
         """Call `callback` with every event of one of `EVENT_KINDS`. Raises InputError for an unknown kind."""
         if kind not in EVENT_KINDS:
             raise InputError(f"on({kind!r}): no such event ({', '.join(EVENT_KINDS)})")

@@ -43,7 +43,6 @@ from sfms_robot.signals.audio import energy_db
 
 RUN_FILE: Final = "run.mcap"
 REPORT_FILE: Final = "report.json"
-FullPolicy = Literal["drop", "wait"]
 RecordFormat = Literal["json", "ros2"]
 Message = tuple[str, float, Report]
 
@@ -113,7 +112,7 @@ ROS2_TOPICS: Final = {topic: f"/sfms_robot{topic}" for topic in _SCHEMAS} | {"/e
 class Recorder(Observer):
     """Observer that writes a run to a folder.
 
-    joints: names, in the order of `Tick.goals_rad`. when_full: "drop" beside a real clock, "wait" in virtual time.
+    joints: names, in the order of `Tick.goals_rad`. wait: for room in the queue, in virtual time.
     about: further texts to keep in the file. Raises ConfigError when the folder cannot be written to.
     """
 
@@ -121,15 +120,16 @@ class Recorder(Observer):
         self,
         folder: Path,
         joints: Sequence[str],
-        when_full: FullPolicy = "drop",
         about: Mapping[str, str] | None = None,
+        *,
+        wait: bool = False,
         queue_length: int = _QUEUE_LENGTH,
         record_format: RecordFormat = "json",
     ) -> None:
         self._joints = tuple(joints)
         self._format = record_format
-        self._wait = when_full == "wait"
-        self._queue: queue.Queue[Tick | SpeakerFrame | Plan | None] = queue.Queue(queue_length)
+        self._wait = wait
+        self._queue = queue.Queue[Tick | SpeakerFrame | Plan | None](queue_length)
         self._dropped = 0
         self._written = 0
         self._trouble: str | None = None

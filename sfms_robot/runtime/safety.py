@@ -110,30 +110,31 @@ class Heat:
         return bool((self.share == 1.0).all())
 
 
+@dataclass(frozen=True)
 class HeatGuard:
     """Temperature derating. warm_C, hot_C: (J,). together: columns of joints that show one pose."""
 
-    def __init__(self, warm_C: Doubles, hot_C: Doubles, together: Sequence[int] = ()) -> None:
-        self._warm_C, self._hot_C, self._together = warm_C, hot_C, list(together)
+    warm_C: Doubles
+    hot_C: Doubles
+    together: list[int]
 
     def judge(self, temperatures_C: Doubles, heat: Heat) -> Heat:
         """Return the shares to move toward for temperatures (J,), NaN where not known."""
         left_hot = np.where(heat.wanted < WARM_SHARE, COOLER_C, 0.0)
         left_warm = np.where(heat.wanted < 1.0, COOLER_C, 0.0)
         with np.errstate(invalid="ignore"):  # NaN is not hot
-            hot = temperatures_C >= self._hot_C - left_hot
-            warm = temperatures_C >= self._warm_C - left_warm
+            hot = temperatures_C >= self.hot_C - left_hot
+            warm = temperatures_C >= self.warm_C - left_warm
         wanted = np.where(hot, 0.0, np.where(warm, WARM_SHARE, 1.0))
-        if self._together:
-            wanted[self._together] = wanted[self._together].min()
+        if self.together:
+            wanted[self.together] = wanted[self.together].min()
         return replace(heat, wanted=wanted)
 
     def after(self, heat: Heat, dt_s: float) -> Heat:
         """Return the shares `dt_s` later."""
         if (heat.share == heat.wanted).all():
             return heat
-        step = np.clip(heat.wanted - heat.share, -PER_S * dt_s, PER_S * dt_s)
-        return replace(heat, share=heat.share + step)
+        return replace(heat, share=heat.share + np.clip(heat.wanted - heat.share, -PER_S * dt_s, PER_S * dt_s))
 
 
 def temperatures_C(joints: Sequence[str], readings: Readings) -> Doubles:

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfms_robot.app.open_head import OpenHead, build_bus, build_motion
+from sfms_robot.app.open_head import OpenHead, build_bus, build_motion, run_log
 from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import drive_head, run_log, run_parts
+from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.app.wiring import calibration_of, plugged_in
 from sfms_robot.config import load_head
 from sfms_robot.config.head import held_back
@@ -76,7 +76,7 @@ def driven(head, servos, seconds, seed, fault=None):
         motion = build_motion(head, rate_hz)
         there = OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
         began_s = clock.now_s()
-        parts, log = run_parts(there, silence, InlineFeed(Restless(), seed)), run_log(there)
+        parts, log = run_parts(there, silence, InlineFeed(Restless(), seed)), run_log(there.config, there.rate_hz)
         report = drive_head(there, parts, Interrupt(), duration_s=seconds, log=log)
         stand = {name: opened[joint.bus].state(joint.id) for name, joint in head.joints.items()}
     assert (report["exit"], report["error"]) == ("done", None)
@@ -102,7 +102,7 @@ def far_from_rest(head, whole, stand):
 @pytest.mark.parametrize("name", HEADS)
 def test_a_head_found_outside_its_limits_runs_and_comes_to_rest(name, careful, seed, share):
     whole = load_head(name)
-    head = held_back(whole) if careful else whole
+    head = held_back(whole, whole.joints) if careful else whole
     servos = found_outside(head, whole, np.random.default_rng(seed), share=share)
     log, motion, _, stand = driven(head, servos, SECONDS, seed)
     assert log.audited.violations == 0
@@ -114,7 +114,7 @@ def test_a_head_found_outside_its_limits_runs_and_comes_to_rest(name, careful, s
 def test_torque_stays_on_until_the_slowest_joint_has_come_to_rest(name):
     """Asked to end while joints are far outside: at 0.3 of their pace they need longer than the face's own easing."""
     whole = load_head(name)
-    head = held_back(whole)
+    head = held_back(whole, whole.joints)
     servos = found_outside(head, whole, np.random.default_rng(2), 2.0, 3.0)
     log, motion, took_s, stand = driven(head, servos, 0.1, 2)
     assert log.audited.violations == 0 and np.abs(log.audited.recent_rad[-1] - motion.rest_rad).max() < ARRIVED_RAD
@@ -124,7 +124,7 @@ def test_torque_stays_on_until_the_slowest_joint_has_come_to_rest(name):
 
 def test_servos_that_do_not_move_get_as_long_as_their_goals_need_and_no_longer():
     whole = load_head("op3_head")
-    head = held_back(whole)
+    head = held_back(whole, whole.joints)
     servos = found_outside(head, whole, np.random.default_rng(2), 2.0, 3.0)
     log, motion, took_s, stand = driven(head, servos, 0.1, 2, "stuck")
     assert np.abs(log.audited.recent_rad[-1] - motion.rest_rad).max() < ARRIVED_RAD

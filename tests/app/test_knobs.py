@@ -5,7 +5,7 @@ import pytest
 from loop_rig import Watcher, driven
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.open_head import build_bus, build_motion
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
@@ -22,10 +22,10 @@ RETARGETER = build_motion(HEAD, 100.0).retargeter
 def test_a_region_at_intensity_0_rests_alone_and_nothing_given_is_what_the_file_says():
     face = np.full(MOTION_DIM, 0.2, dtype=np.float32)
     plain, _ = RETARGETER.step(face, RETARGETER.start())
-    without, _ = RETARGETER.step(face, RETARGETER.start(), turned(HEAD, ["brows=0"]).now)
+    without, _ = RETARGETER.step(face, RETARGETER.start(), LiveKnobs(HEAD, ["brows=0"]).now)
     changed = {name for name, a, b in zip(RETARGETER.joints, plain, without, strict=True) if a != b}
     assert changed and all(name.startswith("brow") for name in changed)
-    same, _ = RETARGETER.step(face, RETARGETER.start(), turned(HEAD).now)
+    same, _ = RETARGETER.step(face, RETARGETER.start(), LiveKnobs(HEAD).now)
     assert np.array_equal(plain, same)
 
 
@@ -41,12 +41,12 @@ def test_a_region_at_intensity_0_rests_alone_and_nothing_given_is_what_the_file_
 )
 def test_a_knob_that_is_none_is_refused_in_one_line(given, said):
     with pytest.raises(ConfigError) as caught:
-        turned(HEAD, [given])
+        LiveKnobs(HEAD, [given])
     assert said in str(caught.value)
 
 
 def test_all_regions_are_turned_together_and_none_leaves_its_range():
-    knobs = turned(HEAD, ["neck=0.5", "brows=1.95"])
+    knobs = LiveKnobs(HEAD, ["neck=0.5", "brows=1.95"])
     before = knobs.values["intensity"]
     knobs.turn_all(0.1)
     assert knobs.values["intensity"] == {region: pytest.approx(min(at + 0.1, 2.0)) for region, at in before.items()}
@@ -60,7 +60,7 @@ def test_all_regions_are_turned_together_and_none_leaves_its_range():
 
 def test_a_knob_turned_while_the_head_runs_takes_effect_within_its_limits():
     head, clock, watcher = load_head("op3_head"), VirtualClock(), Watcher()
-    off, on = turned(head, ["neck=0"]).now, turned(head).now
+    off, on = LiveKnobs(head, ["neck=0"]).now, LiveKnobs(head).now
     with launch(emulated(head)["main"], virtual=True) as chain:
         bus = build_bus(head, {"main": chain}, clock)
         bus.connect()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import sfms_robot
-from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.listen.page_observer import page_facts
 from sfms_robot.app.options import RunOptions
 from sfms_robot.config import load_head
@@ -43,7 +43,7 @@ def test_every_message_and_every_key_of_a_hello_and_of_a_frame_is_described():
     kinds = ("hello", "frame", "event", "status", "controls", "record", "over", "error", "pong")
     assert tuple(rows(TOLD)) == kinds
     head = load_head("face28")
-    facts = page_facts(head, RunOptions(), turned(head), None, choices=True)
+    facts = page_facts(head, RunOptions(), LiveKnobs(head), None, choices=True)
     keys = set(facts) | OF_VISITORS | set(facts["joints"][0]) | set(facts["listeners"][0]) | set(facts["source"])
     assert keys <= rows(TOLD)["hello"]
     record = page_messages.pack_picture(

@@ -89,7 +89,7 @@ def test_twenty_five_pictures_a_second_are_what_was_recorded(recorded):
 
 
 def test_a_position_that_was_old_is_not_shown_as_read(tmp_path):
-    recorder = Recorder(tmp_path / "run", ("slow", "away"), when_full="wait")
+    recorder = Recorder(tmp_path / "run", ("slow", "away"), wait=True)
     for index in range(50):
         readings = {"slow": Reading(0.11, 0.04 * (index % 25)), "away": Reading(0.12, 0.04 * index)}
         recorder.tick(Tick(0.04 * index, np.zeros(MOTION_DIM, np.float32), np.array([0.1, 0.2]), readings))

@@ -29,7 +29,7 @@ def test_what_was_recorded_is_read_back(tmp_path):
 
 
 def test_the_heads_own_voice_is_read_back_beside_the_persons(tmp_path):
-    recorder = Recorder(tmp_path, JOINTS, when_full="wait")
+    recorder = Recorder(tmp_path, JOINTS, wait=True)
     recorder.tick(Tick(0.0, np.zeros(58, np.float32), np.zeros(3), {}))
     for index in range(3):
         said = np.full(640, 0.25 * (index + 1), np.float32)  # of the frame that comes next, as sources give it
@@ -40,7 +40,7 @@ def test_the_heads_own_voice_is_read_back_beside_the_persons(tmp_path):
 
 
 def test_events_that_plans_held_are_read_back(tmp_path):
-    recorder = Recorder(tmp_path, JOINTS, when_full="wait")
+    recorder = Recorder(tmp_path, JOINTS, wait=True)
     recorder.tick(Tick(0.0, np.zeros(58, np.float32), np.zeros(3), {}))
     times_s, frames = np.arange(1, 51) * FRAME_S, np.zeros((50, 58), np.float32)
     frames[20:23, [CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"]]] = 1.0

@@ -11,9 +11,9 @@ from functools import partial
 import pytest
 
 from sfms_robot.app.head.pose import NobodyThere
-from sfms_robot.app.open_head import open_head
+from sfms_robot.app.open_head import open_head, run_log
 from sfms_robot.app.options import HeadOptions, RunOptions
-from sfms_robot.app.session import drive_head, run, run_log, run_parts
+from sfms_robot.app.session import drive_head, run, run_parts
 from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
 from sfms_robot.ports import Source
 from sfms_robot.runtime.safety import Interrupt, Released
@@ -91,7 +91,7 @@ def drive(how=0, fault=None, bus=lambda bus: bus):
         if fault is not None:
             chain.inject(f"{fault}@{opened.clock.now_s() + 0.2}-1000")
         there = replace(opened, bus=bus(opened.bus))
-        parts, log = run_parts(there, Ending(how, interrupt), NobodyThere()), run_log(there)
+        parts, log = run_parts(there, Ending(how, interrupt), NobodyThere()), run_log(there.config, there.rate_hz)
         report = drive_head(there, parts, interrupt, duration_s=0.4, log=log)
         return report, log, [chain.state(joint.id)["torque"] for joint in opened.config.joints.values()]
 

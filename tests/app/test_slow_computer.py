@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfms_robot.app.open_head import open_head
+from sfms_robot.app.open_head import open_head, run_log
 from sfms_robot.app.options import HeadOptions
-from sfms_robot.app.session import drive_head, run_log, run_parts
+from sfms_robot.app.session import drive_head, run_parts
 from sfms_robot.frames import FRAME_HZ, FRAME_S, Plan
 from sfms_robot.lab.bench.throttle_bench import state_problems
 from sfms_robot.listeners.thread import LATE_S, Lateness
@@ -69,7 +69,8 @@ class Burden(Observer):
 def test_a_slow_listener_is_named_while_it_is_slow_and_no_limit_is_broken(tick_takes_s):
     with open_head(HeadOptions(fast=True)) as opened:
         burden, person = Burden(opened.clock, tick_takes_s), open_source(DEFAULT_SPEAKER, "auto", 10.0)
-        parts, log = run_parts(opened, person, SlowListener(), observers=[burden]), run_log(opened)
+        log = run_log(opened.config, opened.rate_hz)
+        parts = run_parts(opened, person, SlowListener(), observers=[burden])
         drive_head(opened, parts, Interrupt(), duration_s=10.0, log=log)
     changes = [(at_s, state.name, state.why) for at_s, state in log.states]
     assert [name for _, name, _ in changes] == [

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from loop_rig import Posed, Watcher, driven
 
-from sfms_robot.app.open_head import build_bus, build_motion
+from sfms_robot.app.open_head import build_bus, build_motion, run_log
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import Chain, launch
@@ -72,7 +72,7 @@ def ran(
     """One run on a fresh bus, in which `place` raises."""
     motion, bus = build_motion(HEAD, RATE_HZ), build_bus(HEAD, {"main": chain}, clock)
     bus.connect()
-    log = RunLog(joints=list(HEAD.joints), period_s=1 / RATE_HZ, audit=motion.audit)
+    log = run_log(HEAD, RATE_HZ)
     parts: dict[str, Any] = {
         "source": PairedSource(duration_s=SECONDS), "feed": InlineFeed(Posed(yaw=lambda times_s: 0.3), 0),
         "timeline": motion.timeline, "retargeter": motion.retargeter, "limiter": motion.limiter, "bus": bus,

@@ -7,13 +7,12 @@ import pytest
 from loop_rig import Watcher, driven
 
 from sfms_robot.app.head.pose import NobodyThere, held_face, parse_face
-from sfms_robot.app.open_head import build_bus, build_motion
+from sfms_robot.app.open_head import build_bus, run_log
 from sfms_robot.app.wiring import emulated
 from sfms_robot.config import load_head
 from sfms_robot.emulator.launch import launch
 from sfms_robot.errors import BusError
 from sfms_robot.runtime.clock import VirtualClock
-from sfms_robot.runtime.log import RunLog
 
 GIVES_UP_S = 6.0
 WHOLE = load_head("open_duck_mini_v2_head")
@@ -31,7 +30,7 @@ def test_the_bus_that_works_comes_to_rest(dead, alive):
         bus = build_bus(HEAD, chains, clock)
         bus.connect()
         stack.callback(bus.close)
-        log = RunLog(joints=list(HEAD.joints), period_s=1 / RATE_HZ, audit=build_motion(HEAD, RATE_HZ).audit)
+        log = run_log(HEAD, RATE_HZ)
         watcher = Watcher({round(2.0 * RATE_HZ) + 1: chains[dead].hang_up})
         with pytest.raises(BusError, match=dead):
             driven(

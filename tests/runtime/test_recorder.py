@@ -99,7 +99,7 @@ def test_a_full_queue_drops_and_counts_and_does_not_block(tmp_path):
 
 
 def test_states_are_kept_when_they_change_and_servos_once_a_second(tmp_path):
-    recorder = Recorder(tmp_path, JOINTS, when_full="wait")
+    recorder = Recorder(tmp_path, JOINTS, wait=True)
     for n, (state, why) in enumerate([("starting", ()), ("listening", ()), ("listening", ()), ("degraded", ("jaw",))]):
         warm = Reading(0.0, 0.0, extra={"temperature_C": 40.0 + n, "current_mA": float("nan")})
         recorder.tick(replace(tick(n * 0.5, {"jaw": warm}), state=state, why=why))
@@ -135,7 +135,7 @@ def test_a_full_disk_is_named_with_its_flag_before_anything_moves_and_later_in_t
     monkeypatch.setattr(recorder_module, "PART_MESSAGES", 10)
     named = f"--record {tmp_path}: No space left on device"
     (tmp_path / part_name(2)).symlink_to("/dev/full")
-    recorder = Recorder(tmp_path, JOINTS, when_full="wait")
+    recorder = Recorder(tmp_path, JOINTS, wait=True)
     for n in range(20):
         recorder.tick(tick(n / 100))
     recorder.close()
@@ -176,7 +176,7 @@ def test_the_report_is_json_and_one_that_cannot_be_written_is_said(tmp_path, cap
 
 def test_a_long_recording_goes_on_in_files_that_are_each_whole(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_module, "PART_MESSAGES", 10)
-    recorder = Recorder(tmp_path, JOINTS, when_full="wait", queue_length=1)
+    recorder = Recorder(tmp_path, JOINTS, wait=True, queue_length=1)
     for k in range(13):
         recorder.tick(tick(k / 100))
     recorder.close()
@@ -193,7 +193,7 @@ def test_a_long_recording_goes_on_in_files_that_are_each_whole(tmp_path, monkeyp
 
 def test_a_recording_that_is_replaced_leaves_no_part_of_the_old_one(tmp_path, monkeypatch):
     monkeypatch.setattr(recorder_module, "PART_MESSAGES", 2)
-    first = Recorder(tmp_path, JOINTS, when_full="wait")
+    first = Recorder(tmp_path, JOINTS, wait=True)
     for k in range(5):
         first.tick(tick(k / 100))
     first.close()

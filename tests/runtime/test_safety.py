@@ -64,10 +64,10 @@ WARM, HOT = np.full(3, 60.0), np.full(3, 67.0)
 
 
 def test_shares_follow_the_temperature_and_come_back_a_little_below() -> None:
-    guard, heat, warm, cooler_c = safety.HeatGuard(WARM, HOT), safety.Heat.cool(3), safety.WARM_SHARE, safety.COOLER_C
+    guard, heat, warm, cool_c = safety.HeatGuard(WARM, HOT, []), safety.Heat.cool(3), safety.WARM_SHARE, safety.COOLER_C
     for degrees, wanted in [
-        (59.9, 1.0), (60.0, warm), (67.0, 0.0), (67.0 - cooler_c + 0.1, 0.0), (67.0 - cooler_c - 0.1, warm),
-        (60.0 - cooler_c + 0.1, warm), (60.0 - cooler_c - 0.1, 1.0),
+        (59.9, 1.0), (60.0, warm), (67.0, 0.0), (67.0 - cool_c + 0.1, 0.0), (67.0 - cool_c - 0.1, warm),
+        (60.0 - cool_c + 0.1, warm), (60.0 - cool_c - 0.1, 1.0),
     ]:  # fmt: skip
         heat = guard.judge(np.array([degrees, 20.0, np.nan]), heat)
         assert heat.wanted.tolist() == [wanted, 1.0, 1.0], degrees
@@ -75,7 +75,7 @@ def test_shares_follow_the_temperature_and_come_back_a_little_below() -> None:
 
 @given(st.lists(st.lists(st.floats(0, 100), min_size=3, max_size=3), min_size=1, max_size=50))
 def test_a_share_never_jumps_and_the_neck_goes_as_one(degrees: list[list[float]]) -> None:
-    guard, heat, dt_s = safety.HeatGuard(WARM, HOT, (0, 2)), safety.Heat.cool(3), 0.01
+    guard, heat, dt_s = safety.HeatGuard(WARM, HOT, [0, 2]), safety.Heat.cool(3), 0.01
     for row in degrees:
         after = guard.after(guard.judge(np.array(row), heat), dt_s)
         assert np.abs(after.share - heat.share).max() <= safety.PER_S * dt_s + 1e-12
@@ -84,7 +84,7 @@ def test_a_share_never_jumps_and_the_neck_goes_as_one(degrees: list[list[float]]
 
 
 def test_a_hot_joint_is_at_rest_after_two_seconds_and_comes_back_when_it_has_cooled() -> None:
-    guard, heat = safety.HeatGuard(WARM, HOT), safety.Heat.cool(3)
+    guard, heat = safety.HeatGuard(WARM, HOT, []), safety.Heat.cool(3)
     for degrees, shown in ((70.0, 0.0), (30.0, 1.0)):
         for _ in range(round(1 / safety.PER_S / 0.01) + 1):
             heat = guard.after(guard.judge(np.array([degrees, 20.0, 20.0]), heat), 0.01)

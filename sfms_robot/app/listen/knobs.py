@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from threading import RLock
 from typing import TYPE_CHECKING, Final
 
@@ -10,7 +11,7 @@ from sfms_robot.app.options import RunOptions, values_by_name
 from sfms_robot.config import Calmness, Head, parse
 from sfms_robot.errors import InputError
 from sfms_robot.ports import Document, Facts
-from sfms_robot.retarget.channel_mapping import ChannelMapping, Knobs
+from sfms_robot.retarget.channel_mapping import ChannelMapping
 from sfms_robot.retarget.head_retargeter import HeadRetargeter
 from sfms_robot.retarget.puppet import Puppet
 from sfms_robot.runtime.halt import HaltLatch
@@ -24,14 +25,15 @@ STEP: Final = 0.1  # of a key
 MOST: Final = 2.0
 
 
+@dataclass(eq=False)
 class Knob:
     """The `intensity` and `style` of one region, 0..2; 1 changes nothing. A new value holds from the next tick on.
 
     Setting raises InputError for a value outside 0..2.
     """
 
-    def __init__(self, knobs: LiveKnobs, region: str) -> None:
-        self._knobs, self._region = knobs, region
+    _knobs: LiveKnobs
+    _region: str
 
     @property
     def intensity(self) -> float:
@@ -58,20 +60,24 @@ class Knob:
 class LiveKnobs:
     """The regions of a head by name. May be set from any thread.
 
+    Args:
+        intensity, style: of `--intensity REGION=V` and `--style REGION=V`, which replace values of the head's file.
+
+    Raises ConfigError for an unknown region or a value outside 0..2.
+
     Attributes:
         values: region -> value, of "intensity" and of "style".
         now: what the loop reads at every tick.
     """
 
-    def __init__(self, head: Head, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
+    def __init__(self, head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> None:
         self._face = ChannelMapping(head)
         self._lock = RLock()
-        self.values: dict[str, dict[str, float]] = {
+        self.values = {
             kind: {name: float(getattr(region, kind)) for name, region in head.regions.items()}
             for kind in ("intensity", "style")
         }
-        self.now: Knobs = self._face.knobs()
-        self.turn(intensity, style)
+        self.turn(values_by_name("--intensity", intensity), values_by_name("--style", style))
 
     def turn(self, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
         """Set values of regions. Raises InputError, with nothing changed, for an unknown region or one outside 0..2."""
@@ -99,14 +105,6 @@ class LiveKnobs:
         return len(self.values["style"])
 
 
-def turned(head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> LiveKnobs:
-    """Return the knobs after `--intensity REGION=V` and `--style REGION=V`, which replace values of the head's file.
-
-    Raises ConfigError for an unknown region or a value outside 0..2.
-    """
-    return LiveKnobs(head, values_by_name("--intensity", intensity), values_by_name("--style", style))
-
-
 # --- all that other threads may do to a run ---------------------------------------------------------------------------
 
 
@@ -126,7 +124,7 @@ class RunControls:
 
     def __init__(self, head: Head, options: RunOptions) -> None:
         self.interrupt, self.halt = Interrupt(), HaltLatch()
-        self.knobs = turned(head, options.intensity, options.style)
+        self.knobs = LiveKnobs(head, options.intensity, options.style)
         self.puppet = Puppet(head.life.gaze, frozenset(HeadRetargeter(head).blind_channels))
         self.calmness = options.calmness or Calmness()
         self.set_rates: Callable[[Calmness], None] | None = None

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -20,12 +19,13 @@ from sfms_robot.app.options import RunOptions
 from sfms_robot.config import Head, load_listener
 from sfms_robot.data import Names, Report
 from sfms_robot.errors import INTERRUPTED, BusError, ConfigError, ModelError, PortError, RobotError
-from sfms_robot.frames import EVENT_KINDS, ListenerEvent, SpeakerFrame
+from sfms_robot.frames import ListenerEvent, SpeakerFrame
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.plugins import listener_folder
 from sfms_robot.ports import Document, Outlet, PlanFeed, Source, Tick
 from sfms_robot.runtime.log import RunLog
 from sfms_robot.runtime.planned_events import EventWatch
+from sfms_robot.signals.quantiles import Quantiles
 
 if TYPE_CHECKING:
     from sfms_robot.app.listen.knobs import LiveKnobs
@@ -73,8 +73,13 @@ def run_report(
             **_counts(limiter, ("chased", "refused")),
         },
         "joints": log.joint_report(),
-        "motion": log.motion_report(),
-        "states": log.state_report(),
+        "motion": {f"{name}s": counter.total() for name, counter in log.counters.items()},
+        "states": {
+            "seconds": {name: round(seconds, 3) for name, seconds in log.state_s.items()},
+            "changes": [
+                {"time_s": round(at_s, 3), "state": state.name, "why": list(state.why)} for at_s, state in log.states
+            ],
+        },
         "attention": log.attention_report(),
         "plans": {**plans, "refused": plans.get("refused", 0) + log.refused_plans},
         "observers_detached": dict(log.detached),
@@ -94,32 +99,39 @@ def figures_so_far(
     person: Source,
     feed: PlanFeed,
     live: LiveKnobs,
-    outputs: Outputs | None,
+    outputs: Outputs,
     more: Document,
 ) -> Report:
     """Return the figures of the report that are known while it runs, under the report's names. From any thread."""
     passed_s = log.listened_s + (1 + log.eased) * log.period_s
     return {
         **_loop_figures(opened, log, None if opened.options.fast else passed_s),
-        "motion": log.motion_so_far(),
+        "motion": {f"{name}s": counter.so_far for name, counter in log.counters.items()},
         "source": dict(person.statistics()),
         "listener_state": dict(feed.statistics()),
         "intensity": live.values["intensity"],
+        "outputs": outputs.statistics(),
         **more(),
-        **({} if outputs is None else {"outputs": outputs.statistics()}),
     }
 
 
 def _loop_figures(opened: OpenHead, log: RunLog, elapsed_s: float | None) -> Report:
-    real = elapsed_s is not None
+    """Return the figures of the loop; those of the wall clock are null without one (`elapsed_s` None)."""
+    measured = log.late_ms, log.frame_to_wire_ms, log.speech_to_wire_ms
+    late_ms, frame_ms, speech_ms = [Quantiles()] * 3 if elapsed_s is None else measured
     return {
         "torque_unconfirmed": log.torque_unconfirmed,
         "frames": log.frames,
         "ticks": log.ticks,
-        "tick": log.tick_report(opened.rate_hz, elapsed_s),
+        "tick": {
+            "target_hz": opened.rate_hz,
+            "achieved_hz": round(log.ticks / elapsed_s, 2) if elapsed_s else None,
+            "late": None if elapsed_s is None else log.late,
+            "jitter_ms": late_ms.report(p50=50, p99=99, max=100),
+        },
         "latency_ms": {
-            "frame_to_wire": log.frame_to_wire_ms.report(p50=50, p99=99) if real else {"p50": None, "p99": None},
-            "speech_to_wire": log.speech_to_wire_ms.report(p50=50, p95=95) if real else {"p50": None, "p95": None},
+            "frame_to_wire": frame_ms.report(p50=50, p99=99),
+            "speech_to_wire": speech_ms.report(p50=50, p95=95),
         },
     }
 
@@ -181,23 +193,13 @@ def limitation(listener: str) -> str | None:
 # --- messages to the programs that a run works with -----------------------------------------------------------------
 
 
-def event_watch(callback: Callable[[ListenerEvent], object]) -> EventWatch:
-    """Return an observer that calls `callback` with events of all kinds, in a thread of its own."""
-    watch = EventWatch()
-    for kind in EVENT_KINDS:
-        watch.on(kind, callback)
-    return watch
-
-
 class OutletObserver(EventWatch):
     """An observer that sends sound, planned events and changes of state to one outlet of a source."""
 
     def __init__(self, outlet: Outlet) -> None:
-        super().__init__()
         self._outlet = outlet
         self._state: tuple[str, Names] | None = None
-        for kind in EVENT_KINDS:
-            self.on(kind, self._event)
+        super().__init__(self._event)
 
     def tick(self, seen: Tick) -> None:
         state = (seen.state, seen.why)

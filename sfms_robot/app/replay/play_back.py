@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from sfms_robot.app.head.pose import FaceTrack
-from sfms_robot.app.listen.knobs import turned
+from sfms_robot.app.listen.knobs import LiveKnobs
 from sfms_robot.app.listen.page_observer import page_facts
 from sfms_robot.app.listen.page_session import stay_for_visitors
 from sfms_robot.app.listen.report import OUTCOME
@@ -83,7 +83,7 @@ def show_recording(folder: Path, page: PageProcess) -> None:
     if tuple(head.joints) != recording.joints:
         raise ConfigError(f"head {head.name!r} has other joints than when the run was recorded")
     options = RunOptions(port=about["port"], listener=about["listener"], seed=int(about["seed"]))
-    facts = page_facts(head, options, turned(head), DEFAULT_SPEAKER if speaker == "default" else speaker)
+    facts = page_facts(head, options, LiveKnobs(head), DEFAULT_SPEAKER if speaker == "default" else speaker)
     page.say("begin", scene=about["head"], **facts | {"replay": True})
     for time_s, kind in recording.events:
         page.say("event", event=kind, at_s=round(time_s, 3))
