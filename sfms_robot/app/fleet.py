@@ -26,6 +26,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
@@ -129,7 +130,7 @@ class FleetControls:
         nonce: goes into the proof of the next command that needs the key.
     """
 
-    def __init__(self, run: RunControls, name: str = "", key: bytes | None = None) -> None:
+    def __init__(self, run: RunControls, name: str, key: bytes | None) -> None:
         self._lock = threading.Lock()
         self.nonce = secrets.token_hex(8)
         self.run, self.name, self._key = run, name, key
@@ -271,6 +272,7 @@ def open_fleet(zenoh: Path | None, insecure: bool = False, key: Path | None = No
         yield Fleet(session, key)
 
 
+@dataclass
 class Fleet:
     """The heads behind a router (`open_fleet`). `key`: file of the fleet's key (`fleet_key`).
 
@@ -278,9 +280,9 @@ class Fleet:
         malformed: count of messages that hold no document.
     """
 
-    def __init__(self, session: Any, key: Path | None = None) -> None:
-        self._session, self._key = session, key
-        self.malformed = 0
+    session: Any
+    key: Path | None = None
+    malformed: int = 0
 
     def states(self) -> list[Facts]:
         """Return the status document of every head that answers, by name. Blocks for `ASK_S` at most."""
@@ -293,7 +295,7 @@ class Fleet:
 
     def resume(self, heads: Sequence[str]) -> list[Facts]:
         """Resume `heads`, or all, by the fleet's key. Raises ConfigError for a key that cannot be used."""
-        key = fleet_key(self._key)
+        key = fleet_key(self.key)
         answers: list[Facts] = []
         for each in self.states():
             name = str(each.get("name"))
@@ -305,16 +307,16 @@ class Fleet:
     def halt(self, heads: Sequence[str], by: str) -> list[Facts]:
         """Halt `heads`, or all; sent twice: on the keys for halting, which need no answer, and as a command."""
         for key in [f"{ROOT}/{fleet_name(head)}/halt" for head in heads] or [f"{ROOT}/*/halt"]:
-            self._session.put(key, by.encode())
+            self.session.put(key, by.encode())
         return self.command(heads, {"command": "halt", "by": by})
 
     def follow(self, receive: Callable[[Facts], None]) -> None:
         """Call `receive` with every document from now on, in a thread of zenoh's."""
-        self._session.declare_subscriber(f"{ROOT}/*/state", lambda sample: self._read(sample, receive))
+        self.session.declare_subscriber(f"{ROOT}/*/state", lambda sample: self._read(sample, receive))
 
     def _ask(self, key: str, payload: bytes) -> list[Facts]:
         answers: list[Facts] = []
-        for reply in self._session.get(key, payload=payload, timeout=ASK_S):
+        for reply in self.session.get(key, payload=payload, timeout=ASK_S):
             if reply.ok is not None:
                 self._read(reply.ok, answers.append)
         return answers

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -24,7 +24,7 @@ from sfms_robot.config.joint import (
     Safety,
 )
 from sfms_robot.config.kinematics import Kinematics, Triple
-from sfms_robot.data import NO_HEAD, head_file
+from sfms_robot.data import NO_HEAD, Report, head_file
 from sfms_robot.errors import not_one_of
 from sfms_robot.frames import LATERAL_POSE, Doubles
 from sfms_robot.ranges import Range
@@ -201,8 +201,7 @@ class Head(Model):
     @property
     def range(self) -> Range:
         """Lowest and highest angles (J,) of all joints."""
-        ends = [(joint.min_rad, joint.max_rad) for joint in self.joints.values()]
-        return Range(*np.array(ends).reshape(-1, 2).T)
+        return Range(*np.array([(joint.min_rad, joint.max_rad) for joint in self.joints.values()]).reshape(-1, 2).T)
 
     def on_bus(self, bus: str) -> dict[str, Joint]:
         """Return the joints of one bus, by name."""
@@ -258,7 +257,7 @@ def expanded(raw: Any) -> Any:
     return {**raw, "joints": joints}
 
 
-def _seen_in_mirror(twin: dict[str, Any], sense: Any) -> dict[str, Any]:
+def _seen_in_mirror(twin: Report, sense: Any) -> Report:
     out = {key: value for key, value in twin.items() if key not in NOT_SHARED}
     if sense != "opposite":  # a servo on the other side of the head turns the other way for the same motion
         return {**out, "sign": -1 if out.get("sign", 1) == 1 else 1}
@@ -268,15 +267,14 @@ def _seen_in_mirror(twin: dict[str, Any], sense: Any) -> dict[str, Any]:
     return out
 
 
-def held_back(head: Head, joints: Collection[str] | None = None) -> Head:
-    """Return the head with `joints` (all of them by default) at 20 % of their travel and 0.3 of their limits.
+def held_back(head: Head, joints: Iterable[str]) -> Head:
+    """Return the head with `joints` at 20 % of their travel and 0.3 of their limits.
 
     Servo horns sit differently on every build, so a face that moves as its file says may drive a lip into the teeth.
     A joint whose zero and range have not been measured therefore keeps near its rest and moves slowly.
     """
-    names = head.joints if joints is None else joints
     limits, held = dict(head.limits), dict(head.joints)
-    for name in names:
+    for name in joints:
         joint = head.joints[name]
         rest, slow = joint.rest_deg, joint.limits + _SUFFIX
         limits[slow] = LimitClass(**{key: PACE * value for key, value in head.limit(name)})
@@ -313,8 +311,7 @@ def _inlined(node: Expression, expressions: Mapping[str, Expression]) -> Express
     """Return the expression with every shared one in the place of its name."""
     if node.use is not None:
         shared = _inlined(expressions[node.use], expressions)
-        plain = node.replaced(use=None)
-        return shared if node == Expression(use=node.use) else plain.replaced(sum=(shared,))
+        return shared if node == Expression(use=node.use) else node.replaced(use=None, sum=(shared,))
     if node.group is None:
         return node
     return node.replaced(**{node.group: tuple(_inlined(part, expressions) for part in node.parts)})
@@ -323,8 +320,7 @@ def _inlined(node: Expression, expressions: Mapping[str, Expression]) -> Express
 def mirrored(node: Expression) -> Expression:
     """Return the expression of the other side of the face."""
     if node.channel in LATERAL_POSE:
-        turned = Expression(channel=node.channel, gain=-1)
-        return node.replaced(channel=None, sum=(turned,))
+        return node.replaced(channel=None, sum=(Expression(channel=node.channel, gain=-1),))
     if node.channel is not None:
         return node.replaced(channel=other_side(node.channel))
     assert node.group is not None

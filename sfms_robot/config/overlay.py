@@ -28,7 +28,7 @@ from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
 from sfms_robot.config.head import NOT_SHARED, Head, load_head
 from sfms_robot.config.joint import Expression, Joint, Safety
-from sfms_robot.data import data_dir, head_file, user_dir, write_whole
+from sfms_robot.data import Names, data_dir, head_file, user_dir, write_whole
 from sfms_robot.errors import ConfigError
 from sfms_robot.ports import Facts
 
@@ -151,7 +151,7 @@ class Layered:
     calibrated: frozenset[str] = frozenset()
     refused: Mapping[str, str] = field(default_factory=dict)
     fitted: frozenset[str] = frozenset()
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
 
 
 def overlay_file(head: str, practice: bool = False) -> Path:
@@ -237,7 +237,7 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
     )
 
 
-def calibrated(joint: Joint, found: Measured, usual: Safety | None = None) -> Joint:
+def calibrated(joint: Joint, found: Measured, usual: Safety) -> Joint:
     """Return the joint with measured zero, direction and ends; its rest keeps its angle, at the measured centre.
 
     `usual`: safety of the head, which that of the joint overrides.
@@ -246,7 +246,7 @@ def calibrated(joint: Joint, found: Measured, usual: Safety | None = None) -> Jo
     zero_ticks = round(found.center_ticks - ticks_per_deg * joint.rest_deg)
     low, high = ((ticks - zero_ticks) / ticks_per_deg for ticks in (found.min_ticks, found.max_ticks))
     ends = {"min_deg": min(low, joint.rest_deg), "max_deg": max(high, joint.rest_deg)}
-    joint = declared(joint, found.stored, usual or Safety())
+    joint = declared(joint, found.stored, usual)
     return joint.replaced(zero_ticks=zero_ticks, sign=found.sign, **ends)
 
 
@@ -283,10 +283,7 @@ def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bo
 
 # --- Origin of each value: its own line, its twin, the head's defaults, or nowhere; then this build -------------------
 
-SHOWN: Final = (
-    "bus", "id", "model", "zero_ticks", "sign", "ratio", "min_deg", "rest_deg", "max_deg", "limits", "lag_ms", "unit",
-    "drive",
-)  # fmt: skip
+SHOWN: Final = tuple(key for key in Joint.model_fields if key not in ("mirror_of", "mirror_sense", "safety", "note"))
 MEASURED: Final = ("zero_ticks", "sign", "min_deg", "max_deg")  # given by a calibration
 
 
@@ -299,7 +296,7 @@ def provenance(name: str) -> tuple[dict[str, dict[str, tuple[Any, str]]], list[s
     raw = read(head_file(name))
     overlay = load_overlay(head)
     layers = layered(head, overlay, head_hash(name))
-    found: dict[str, dict[str, tuple[Any, str]]] = {}
+    found = {}
     for joint, config in layers.head.joints.items():
         origins = {key: _origin(key, head.joints[joint], raw["joints"][joint], raw) for key in SHOWN}
         if joint in layers.calibrated:

@@ -305,8 +305,8 @@ def test_a_run_takes_measured_joints_as_they_are_and_holds_the_others_back(name,
     assert found is not None
     with launch(emulated(head)["main"]) as chain:
         ready = ready_on(name, chain.device)
-    assert ready.joints["jaw"] == calibrated(head.joints["jaw"], found.joints["jaw"])
-    assert ready.joints["brow"] == held_back(head).joints["brow"] and ready_on(name, "sim") == head
+    assert ready.joints["jaw"] == calibrated(head.joints["jaw"], found.joints["jaw"], head.safety)
+    assert ready.joints["brow"] == held_back(head, head.joints).joints["brow"] and ready_on(name, "sim") == head
     assert "not calibrated in brow" in caplog.text
 
 

@@ -20,7 +20,7 @@ class Run(RunControls):
         self.set_rates = self.calmed.append
 
     def obey(self, **command):
-        return FleetControls(self).obey(json.dumps(command).encode())
+        return FleetControls(self, "", None).obey(json.dumps(command).encode())
 
 
 @pytest.fixture
@@ -114,7 +114,7 @@ def test_what_cannot_be_obeyed_is_one_line(run, command, said):
      b'{"command": "knobs", "intensity": {"neck": 1' + 400 * b"0" + b"}}"],
 )  # fmt: skip
 def test_nonsense_is_answered_and_does_nothing(run, message):
-    assert "error" in FleetControls(run).obey(message)
+    assert "error" in FleetControls(run, "", None).obey(message)
     assert run.halt.by is None and not run.interrupt()
 
 

@@ -278,11 +278,11 @@ def test_nothing_but_torque_is_written_whatever_model_the_head_names(model, name
             return {value["register"]: value["raw"] for value in values if not value["register"].startswith(live)}
 
         before = settings(1)
-        assert release_chain(wire, dict.fromkeys((1, 2), Table.of(load_firmware_map(named)))) == {1: "", 2: ""}
+        assert release_chain(wire, dict.fromkeys((1, 2), Table.of(load_firmware_map(named))), False) == {1: "", 2: ""}
         assert settings(1) == before and not chain.state(1)["torque"] and not chain.state(2)["torque"]
         if model == "xl330-m288":
             put(wire, 1, "torque_enable", 1)
             level = wire.find(1).registers()["status_return_level"]
             wire.link.write(1, level.address, b"\0")  # it answers pings only
-            note = release_chain(wire, {1: Table.of(load_firmware_map(model))})[1]
+            note = release_chain(wire, {1: Table.of(load_firmware_map(model))}, False)[1]
             assert "status return level" in note and not chain.state(1)["torque"]

@@ -14,7 +14,7 @@ HEADS = head_names()
 @pytest.mark.parametrize("name", HEADS)
 def test_every_joint_keeps_its_rest_and_a_fifth_of_its_travel_at_less_than_a_third_of_its_pace(name):
     head = load_head(name)
-    held = held_back(head)
+    held = held_back(head, head.joints)
     for joint, before in head.joints.items():
         after, limit, was = held.joints[joint], held.limit(joint), head.limit(joint)
         assert after.rest_deg == before.rest_deg
@@ -38,7 +38,7 @@ def test_only_an_uncalibrated_head_on_real_servos_holds_back(caplog):
     assert ready(face, real=False) is face and ready(face, real=True, calibrated=face.joints) is face
     assert ready(turret, real=True) is turret
     assert not caplog.records
-    assert ready(face, real=True) == held_back(face)
+    assert ready(face, real=True) == held_back(face, face.joints)
     assert "face28 is not calibrated: 20 %" in caplog.text
 
 

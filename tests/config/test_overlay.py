@@ -53,7 +53,7 @@ def test_ends_and_rest_lie_where_they_were_measured(joint, sign):
     at_end = config.rest_deg == config.min_deg
     ticks = (1800, 1800 if at_end else 2010, 2400)
     low, rest, high = ticks if sign > 0 else [4095 - t for t in ticks]
-    found = overlays.calibrated(config, measured(joint, low, rest, high, sign))
+    found = overlays.calibrated(config, measured(joint, low, rest, high, sign), FACE.safety)
     conversion = Calibration({joint: found}, np.array([load_firmware_map(config.model).ticks_per_revolution]))
     angles = [[math.radians(found.min_deg)], [found.rest_rad], [found.max_rad]]
     assert [int(conversion.to_ticks(np.array(a))[0]) for a in angles] == pytest.approx([low, rest, high], abs=1)
@@ -73,7 +73,7 @@ def test_without_an_overlay_the_head_is_as_its_file_says_and_with_one_only_what_
     assert layers.head == FACE and not layers.calibrated and not layers.refused
     layers = overlays.layered(FACE, overlay(jaw=measured()), SHA, {"jaw": identity(measured())})
     assert layers.calibrated == {"jaw"} and not layers.refused
-    assert layers.head.joints["jaw"] == overlays.calibrated(FACE.joints["jaw"], measured())
+    assert layers.head.joints["jaw"] == overlays.calibrated(FACE.joints["jaw"], measured(), FACE.safety)
     assert {**layers.head.joints, "jaw": None} == {**FACE.joints, "jaw": None}
 
 

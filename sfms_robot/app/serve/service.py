@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -230,10 +230,10 @@ def serve(
     over: threading.Event,
     say: Callable[[str], None],
     *,
-    router: Path | None = None,
-    insecure: bool = False,
-    metrics: str | None = None,
-    processes: int | None = None,
+    router: Path | None,
+    insecure: bool,
+    metrics: str | None,
+    processes: int | None,
 ) -> Report:
     """Serve until `over` is set, and return the figures. Blocks until then.
 
@@ -329,17 +329,17 @@ def metrics_server(wanted: str) -> LocalServer:
     return server
 
 
+@dataclass(frozen=True)
 class _Collector:
     """The statistics as Prometheus reads them."""
 
-    def __init__(self, statistics: Document) -> None:
-        self._statistics = statistics
+    statistics: Document
 
     def collect(self) -> Iterable[Any]:
         """Yield one metric for each figure that the statistics hold now."""
         from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
-        statistics = self._statistics()
+        statistics = self.statistics()
         families = [(GaugeMetricFamily, each) for each in _GAUGES] + [(CounterMetricFamily, each) for each in _COUNTERS]
         for family, (name, text, place) in families:
             value: Any = reduce(lambda found, key: found[key], place.split("."), statistics)

@@ -148,7 +148,7 @@ Unconfirmed = dict[int, str]  # by id: why it is not known that its torque is of
 SILENT: Final = "does not answer; torque off was sent"
 
 
-def release_head(name: str, port: str, everything: bool = False) -> list[Row]:
+def release_head(name: str, port: str, everything: bool) -> list[Row]:
     """Take torque off the servos of a head on `port`, as `release`."""
     head = load_head(name)
     with open_wires(head, port) as opened:
@@ -161,8 +161,7 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
     The servos need not be those that the head's file names. `everything`: also servos and channels of other ids.
     Joints on a bus whose port fails are unconfirmed. Raises PortError and BusError if no bus could be used.
     """
-    rows: list[Row] = []
-    failures: list[RobotError] = []
+    rows, failures = [], []
     for name, where in opened.items():
         joints = head.on_bus(name)
         bus, servos = head.buses[name], bus_servos(head, joints)
@@ -175,8 +174,7 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
                 off = dict.fromkeys(channels, "" if board is None or board.end_pulses(channels) else SILENT)
             else:
                 with closing(port_of(where, bus, clock)()) as port:
-                    wire = Wire(port, bus.family, bus.baud, fixed=True)
-                    off = release_chain(wire, tables, everything)
+                    off = release_chain(Wire(port, bus.family, bus.baud, fixed=True), tables, everything)
         except (PortError, BusError) as error:
             failures.append(error)
             off = dict.fromkeys(names, str(error))
@@ -188,7 +186,7 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
     return rows
 
 
-def release_chain(wire: Wire, tables: Mapping[int, Table], everything: bool = False) -> Unconfirmed:
+def release_chain(wire: Wire, tables: Mapping[int, Table], everything: bool) -> Unconfirmed:
     """Write torque off to the servos of `tables`, by id, until they confirm it. Raises BusError when the port fails.
 
     A servo that answers a ping is written where the model that it names keeps its torque, a silent one where the head
