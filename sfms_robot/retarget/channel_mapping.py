@@ -84,10 +84,11 @@ class ChannelMapping:
         joints: names, in the order of the head's file.
         blind_channels: channels that no drive follows; none of a head without joints, which outputs alone show.
         dead_joints: joints without a drive.
+        file_knobs: those of the head's file.
     """
 
     def __init__(self, head: Head) -> None:
-        self.joints: Sequence[str] = tuple(head.joints)
+        self.joints = tuple(head.joints)
         self._regions = head.regions
         self._units = Units.of(head)
         self._range = head.range
@@ -99,9 +100,9 @@ class ChannelMapping:
         self._at_least = np.array([each.at_least for each in head.couplings])
         self._moving = [[self.joints.index(name) for name in each.moving] for each in head.couplings]
         followed = set[str]().union(*(tree.channels() for tree in trees.values() if tree))
-        self.blind_channels: Sequence[str] = tuple(name for name in CHANNELS if trees and name not in followed)
-        self.dead_joints: Sequence[str] = tuple(name for name, tree in trees.items() if tree is None)
-        self._knobs = self.knobs()
+        self.blind_channels = tuple(name for name in CHANNELS if trees and name not in followed)
+        self.dead_joints = tuple(name for name, tree in trees.items() if tree is None)
+        self.file_knobs = self.knobs()
 
     def knobs(self, intensity: Mapping[str, float] | None = None, style: Mapping[str, float] | None = None) -> Knobs:
         """Return knobs per region over those of the head's file. Raises InputError for an unknown region or value."""
@@ -109,8 +110,9 @@ class ChannelMapping:
         for kind, given in (("intensity", intensity or {}), ("style", style or {})):
             for name, value in given.items():
                 if name not in self._regions:
-                    choices = ", ".join(self._regions) or "none"
-                    raise InputError(f"{kind}: {name!r} is not a region of this head ({choices})")
+                    raise InputError(
+                        f"{kind}: {name!r} is not a region of this head ({', '.join(self._regions) or 'none'})"
+                    )
                 if not 0 <= value <= 2:
                     raise InputError(f"{kind} of {name} = {value:g} is not in 0..2")
             for name, region in self._regions.items():
@@ -131,7 +133,7 @@ class ChannelMapping:
             where = np.argwhere(~finite)[0]
             raise ValueError(f"motion channel {CHANNELS[where[-1]]} is {motion[tuple(where)]}")
         values = self._inside(self._program(motion))
-        knobs = knobs or self._knobs
+        knobs = knobs or self.file_knobs
         if not knobs.neutral:
             values = self._inside(self._turned(values, knobs))
         if self._moving:
@@ -287,7 +289,7 @@ class Program:
     @classmethod
     def of(cls, trees: Sequence[Expression | None]) -> Program:
         """Compile plain expressions, without shared ones; None gives 0."""
-        forest: list[Tree] = [(row, merged(tree) if tree else STILL) for row, tree in enumerate(trees)]
+        forest = [(row, merged(tree) if tree else STILL) for row, tree in enumerate(trees)]
         levels: list[_Level] = []
         for _ in range(max((_depth(tree) for _, tree in forest), default=0)):
             level, forest = _level(forest)

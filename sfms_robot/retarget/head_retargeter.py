@@ -9,7 +9,7 @@ passes from tick to tick.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -48,12 +48,12 @@ class HeadRetargeter:
 
     def __init__(self, head: Head, dt_s: float = 0.01) -> None:
         self.mapping = ChannelMapping(head)
-        self.joints: Sequence[str] = self.mapping.joints
+        self.joints = self.mapping.joints
         self.neck = build_neck(head.kinematics, head.joints) if head.kinematics else None
-        self.blind_channels: Sequence[str] = self.mapping.blind_channels
-        self.dead_joints: Sequence[str] = self.mapping.dead_joints
+        self.blind_channels = self.mapping.blind_channels
+        self.dead_joints = self.mapping.dead_joints
         self.neck_columns = np.zeros(0, dtype=np.intp)
-        self._dt_s, self._knobs = dt_s, self.mapping.knobs()
+        self._dt_s = dt_s
         if self.neck is None:
             return
         self.neck_columns = np.array([self.joints.index(name) for name in self.neck.joints], dtype=np.intp)
@@ -104,7 +104,7 @@ class HeadRetargeter:
 
     def _turned(self, motion: Floats, knobs: Knobs | None) -> Doubles:
         """Return the poses (..., 6) of motion (..., 58), changed by the knobs of the neck's region."""
-        first, knobs = self.neck_columns[0], knobs or self._knobs
+        first, knobs = self.neck_columns[0], knobs or self.mapping.file_knobs
         pose = motion[..., :_POSE].astype(np.float64)
         if knobs.style[first] != 1.0:  # the same law as of the mapping's joints, over the pose
             pose *= 1.0 + (knobs.style[first] - 1.0) * (1.0 - np.minimum(np.abs(pose) / _LARGE, 1.0))

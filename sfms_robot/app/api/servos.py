@@ -11,6 +11,7 @@ import logging
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from typing import Any, Final, Self
 
 import numpy as np
@@ -25,7 +26,6 @@ from sfms_robot.config import Head, load_head
 from sfms_robot.data import Report
 from sfms_robot.errors import BusError, ConfigError, InputError, RobotError
 from sfms_robot.frames import POSE, Doubles, Floats, Readings
-from sfms_robot.motion.limits import JointLimits
 from sfms_robot.ports import Observer, Tick
 from sfms_robot.runtime.halt import HaltLatch
 from sfms_robot.runtime.safety import Interrupt
@@ -225,9 +225,9 @@ class Servos(Driven):
     def __enter__(self) -> Self:
         """Connect. Blocks while the servos are identified; torque stays as found. Raises RobotError."""
         self._opened = self._stack.enter_context(open_head(self._options))
-        head, limits = self._opened.config, JointLimits.of(self._opened.config)
-        self.joints = tuple(head.joints)
-        self.low_rad, self.high_rad, self.rest_rad = limits.low, limits.high, head.rest_rad
+        head = self._opened.config
+        self.joints, self._range = tuple(head.joints), head.range
+        self.low_rad, self.high_rad, self.rest_rad = self._range.low, self._range.high, head.rest_rad
         return self
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
@@ -245,7 +245,7 @@ class Servos(Driven):
         readings = self._opened.bus.poll(self._opened.clock.now_s())
         stands = [readings[joint].position_rad if joint in readings else None for joint in self.joints]
         found = [rest if at is None else at for at, rest in zip(stands, self.rest_rad.tolist(), strict=True)]
-        self._target = _Target(np.clip(found, self.low_rad, self.high_rad), self.joints)
+        self._target = _Target(self._range.nearest(np.array(found)), self.joints)
         self._run = Background(self._drive, Interrupt(), HaltLatch())
         self._run.start()
 
@@ -294,12 +294,12 @@ class Servos(Driven):
         angles = np.array(angles_rad, np.float64)
         if angles.shape != (len(self.joints),):
             raise InputError(f"angles have shape {angles.shape}; this head has ({len(self.joints)},) joints")
-        inside = (angles >= self.low_rad - SLACK_RAD) & (angles <= self.high_rad + SLACK_RAD)
+        inside = self._range.holds(angles, SLACK_RAD)
         if not inside.all():
             worst = int(np.argmin(inside))
-            low, high = self.low_rad[worst], self.high_rad[worst]
-            raise InputError(f"{self.joints[worst]} = {angles[worst]:g} rad is not in {low:.4f}..{high:.4f}")
-        return np.clip(angles, self.low_rad, self.high_rad)
+            inside_rad = f"{self.low_rad[worst]:.4f}..{self.high_rad[worst]:.4f}"
+            raise InputError(f"{self.joints[worst]} = {angles[worst]:g} rad is not in {inside_rad}")
+        return self._range.nearest(angles)
 
     def _drive(self, now: Background) -> Report:
         opened, alone = self._opened, NobodyThere()
@@ -307,12 +307,12 @@ class Servos(Driven):
         return drive_head(opened, parts, now.interrupt)
 
 
+@dataclass
 class _Target:
     """A `Retargeter` that returns the angles (J,) written last, for every face."""
 
-    def __init__(self, angles_rad: Doubles, joints: Sequence[str]) -> None:
-        self.angles_rad = angles_rad
-        self.joints = joints
+    angles_rad: Doubles
+    joints: Sequence[str]
 
     def start(self) -> None:
         return None
