@@ -11,6 +11,7 @@ import os
 import socket
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Final
 
 from sfms_robot.data import Names, Report
@@ -127,7 +128,7 @@ def _person(frame: SpeakerFrame) -> Report:
     return {
         "voice_db": round(energy_db(frame.audio), 1) if len(frame.audio) else None,
         "seen": frame.face is not None,
-        "attention": None if frame.attention is None else _number(frame.attention),
+        "attention": _number(frame.attention),
         "own_voice_db": None if frame.agent_audio is None else round(energy_db(frame.agent_audio), 1),
     }
 
@@ -137,9 +138,8 @@ def _servos(seen: Tick, names: Sequence[str]) -> Report:
     joints = {}
     for joint, goal_rad in zip(names, seen.goals_rad.tolist(), strict=True):
         if (reading := seen.readings.get(joint)) is not None:
-            present = None if reading.position_rad is None else _number(reading.position_rad)
-            joints[joint] = {"goal_rad": _number(goal_rad), "present_rad": present, "age_s": _number(reading.age_s)}
-            joints[joint] |= {name: _number(value) for name, value in reading.extra.items()}
+            read = {"present_rad": reading.position_rad, "age_s": reading.age_s, **reading.extra}
+            joints[joint] = {name: _number(value) for name, value in {"goal_rad": goal_rad, **read}.items()}
     warmth = {joint: reading.extra.get("temperature_C", math.nan) for joint, reading in seen.readings.items()}
     known = {joint: degrees for joint, degrees in warmth.items() if math.isfinite(degrees)}
     hottest = max(known, key=lambda joint: known[joint], default=None)
@@ -150,8 +150,8 @@ def _servos(seen: Tick, names: Sequence[str]) -> Report:
     }
 
 
-def _number(value: float) -> float | None:
-    return round(float(value), _DIGITS) if math.isfinite(value) else None
+def _number(value: float | None) -> float | None:
+    return round(float(value), _DIGITS) if value is not None and math.isfinite(value) else None
 
 
 class ServiceManager:
@@ -200,17 +200,17 @@ class ServiceManager:
             sender.sendto(lines.encode(), address)
 
 
+@dataclass(eq=False)
 class NotifyingObserver(Observer):
     """Observer that reports a run as ready when its joints are led into the face, and as alive while it ticks.
 
     So the service manager restarts a loop that hangs, whatever else still runs.
     """
 
-    def __init__(self, manager: ServiceManager) -> None:
-        self._manager = manager
-        self._next_s = 0.0
-        self._ready = False
-        self._shown: tuple[str, Names] | None = None
+    manager: ServiceManager
+    _next_s: float = 0.0
+    _ready: bool = False
+    _shown: tuple[str, Names] | None = None
 
     def tick(self, seen: Tick) -> None:
         """Send at most one datagram in most ticks, without waiting for it."""
@@ -219,11 +219,11 @@ class NotifyingObserver(Observer):
             words = ": ".join([seen.state, *([", ".join(seen.why)] if seen.why else [])])
             if not self._ready and seen.state in RUNNING:
                 self._ready = True
-                self._manager.ready(words)
+                self.manager.ready(words)
             elif seen.state == "stopping":
-                self._manager.stopping()
+                self.manager.stopping()
             else:
-                self._manager.status(words)
+                self.manager.status(words)
         if seen.time_s >= self._next_s:
-            self._next_s = seen.time_s + self._manager.every_s
-            self._manager.alive()
+            self._next_s = seen.time_s + self.manager.every_s
+            self.manager.alive()

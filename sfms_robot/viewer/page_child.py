@@ -34,7 +34,7 @@ class FromRun:
     def __init__(self, page: PageServer, scene_of: SceneOf) -> None:
         self._page, self._scene_of = page, scene_of
         self._loop = asyncio.get_running_loop()
-        self._waiting: deque[Any] = deque()
+        self._waiting = deque[Any]()
 
     def put(self, message: Any) -> None:
         """Take a message, in the thread that reads."""
@@ -101,7 +101,7 @@ async def _serve(address: Address, parent: ParentPipe, scene_of: SceneOf) -> Non
     )
     serving = asyncio.create_task(server.serve(sockets=[place.socket]))
     page.prepare()
-    send(0, {"bound": place.url, "token": place.token, "taken": place.taken})
+    send(0, {"bound": place.url, "taken": place.taken})
     while not over.is_set():
         writer.send(pickle.dumps(None))  # a sign of life
         with suppress(TimeoutError):

@@ -84,7 +84,6 @@ class PageProcess:
     Attributes:
         url: where the page is, with its token where it needs one.
         taken: port that was wanted and is used by another program; None where it was free.
-        token: None on loopback.
         visitors: how many look at it now.
         visited: set once the number of visitors has changed.
     """
@@ -92,7 +91,6 @@ class PageProcess:
     def __init__(self, address: Address, child: str = CHILD) -> None:
         self.url = ""
         self.taken: int | None = None
-        self.token: str | None = None
         self.visitors = 0
         self.visited = threading.Event()
         self._asked: Asked | None = None
@@ -130,14 +128,9 @@ class PageProcess:
         """Report a server that hangs, once, and once when it is back. The run's loop calls it a few times a second."""
         self._supervised.check(now_s, self._supervised.child.gave_sign())
 
-    @property
-    def hung(self) -> bool:
-        """Return whether it has given no sign of life for a while; see `watch`."""
-        return self._supervised.hung
-
     def statistics(self) -> Report:
         """Return for status and report: whether it hangs now, and how often it has."""
-        return {"hung": self.hung, "hangs": self._supervised.hangs}
+        return {"hung": self._supervised.hung, "hangs": self._supervised.hangs}
 
     def show(self, record: bytes) -> None:
         """Send a packed picture; an older one that has not left yet is left out."""
@@ -174,7 +167,7 @@ class PageProcess:
         if isinstance(content, bytes):
             self._pass_on(visitor, lambda asked: asked.person(visitor, content))
         elif "bound" in content:
-            self.url, self.token, self.taken = content["bound"], content["token"], content["taken"]
+            self.url, self.taken = content["bound"], content["taken"]
             self._supervised.enter("running")
             self._bound.set()
         elif "problem" in content:

@@ -71,7 +71,7 @@ class Visitor:
         self.number, self.allowed, self.used_s = number, allowed, now_s
         self.malformed, self.behind = 0, False
         self._picture: str | None = None
-        self._outbox: deque[str] = deque()
+        self._outbox = deque[str]()
         self._something = asyncio.Event()
         self._due_s = now_s - BURST_S
 
@@ -225,7 +225,7 @@ class PageServer:
         self._record: Facts | None = None
         self._recording: Path | None = None
         self._over: Facts | None = None  # the report
-        self._history: deque[tuple[bool, bytes]] = deque(maxlen=KEPT_FRAMES)  # (packed picture or not, message)
+        self._history = deque[tuple[bool, bytes]](maxlen=KEPT_FRAMES)  # (packed picture or not, message)
         self._files, self._human = CompressedFiles(), CompressedFiles(HUMAN)
         self.app = application(
             [
@@ -253,10 +253,9 @@ class PageServer:
         `new_scene`: makes the picture of its head. One remembers where it was; a replay has its own.
         """
         self._new_scene, self._scene, self._over = new_scene, new_scene(), None
-        drawn: Report = {}
+        self._hello = dict(hello)
         if (scene := self._scene) is not None:
-            drawn = {"urdf": URDF, "urdf_joints": scene.joints, "urdf_generic": scene.generic}
-        self._hello = {**hello, **drawn}
+            self._hello |= {"urdf": URDF, "urdf_joints": scene.joints, "urdf_generic": scene.generic}
         self._history.clear()
         self._began.set()
         for visitor in self._visitors:

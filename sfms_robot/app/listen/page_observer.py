@@ -21,7 +21,7 @@ from sfms_robot.app.listen.report import event_row
 from sfms_robot.app.options import RunOptions
 from sfms_robot.config import Calmness, Head, load_listener
 from sfms_robot.data import Report
-from sfms_robot.frames import CHANNELS, FRAME_HZ, Floats, Plan, SpeakerFrame
+from sfms_robot.frames import CHANNELS, FRAME_HZ, NO_SOUND, Floats, Plan, SpeakerFrame
 from sfms_robot.listeners.events.model import load_tables
 from sfms_robot.plugins import listener_folder
 from sfms_robot.ports import Document, Observer, Tick
@@ -116,13 +116,13 @@ class PageObserver(Observer):
         self.document: Document | None = None
         self._page, self._joints = page, tuple(joints)
         self._index = -1
-        self._frame: SpeakerFrame | None = None
+        self._frame = SpeakerFrame(0.0, NO_SOUND)
         self._voice_db = self._own_db = NOTHING
         self._ear = voice_activity.start()
         self._hazards_hz: Mapping[str, float] = {}
         self._told_s = -math.inf
         self._rare: tuple[Any, bytes] = (None, b"")
-        self._plans: deque[Plan] = deque(maxlen=_WAITING)
+        self._plans = deque[Plan](maxlen=_WAITING)
         self._events = PlannedEvents()  # of the thread that sends
 
     def tick(self, seen: Tick) -> None:
@@ -157,7 +157,7 @@ class PageObserver(Observer):
         return pack_picture(
             seen.time_s, seen.motion, seen.goals_rad, self._read_rad(seen), self._rare_json(seen),
             voice_db=self._voice_db, own_voice_db=self._own_db, talking=self._ear.active,
-            attention=None if frame is None else frame.attention, place_m=None if frame is None else frame.place_m,
+            attention=frame.attention, place_m=frame.place_m,
         )  # fmt: skip
 
     def _tell(self) -> None:
@@ -175,10 +175,9 @@ class PageObserver(Observer):
 
     def _read_rad(self, seen: Tick) -> Floats:
         """Return (J,) angles; NaN without a recent one: legs of a platform read at other times fit no pose of now."""
-        readings = (seen.readings.get(joint) for joint in self._joints)
         read = (
             math.nan if each is None or each.position_rad is None or each.age_s > AWAY_S else each.position_rad
-            for each in readings
+            for each in map(seen.readings.get, self._joints)
         )  # fmt: skip
         return np.fromiter(read, np.float32, len(self._joints))
 
