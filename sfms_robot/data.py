@@ -8,7 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from sfms_robot.errors import ConfigError, did_you_mean
+from sfms_robot.errors import CHECKOUT, ConfigError, did_you_mean
 
 SPEAKER_VOICE: Final = "speech.flac"  # in the folder of each shipped speaker
 _ARCHIVES: Final = {b"PK\x03\x04": "zip", b"7z\xbc\xaf": "7z", b"Rar!": "rar", b"BZh": "bz2", b"\xfd7zXZ": "xz"}
@@ -28,9 +28,8 @@ def data_dir(name: Shipped) -> Path:
     installed = Path(str(files("sfms_robot"))) / name
     if installed.is_dir():
         return installed
-    checkout = Path(__file__).resolve().parent.parent
-    if (checkout / "pyproject.toml").is_file() and (checkout / name).is_dir():
-        return checkout / name
+    if (CHECKOUT / "pyproject.toml").is_file() and (CHECKOUT / name).is_dir():
+        return CHECKOUT / name
     raise FileNotFoundError(f"the package's own folder {name!r} is missing: reinstall sfms-robot")
 
 
@@ -81,9 +80,9 @@ def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
             return folder
     if Path(name).name == marker and Path(name).is_file():
         return Path(name).parent
-    choices, one = shipped_names(root, marker), kind.removesuffix("s")
-    problem = f"{one} {name!r} is neither a shipped name nor a folder with a {marker} ({', '.join(choices)})"
-    raise ConfigError(problem + did_you_mean(name, choices))
+    choices = shipped_names(root, marker)
+    neither = f"is neither a shipped name nor a folder with a {marker} ({', '.join(choices)})"
+    raise ConfigError(f"{kind.removesuffix('s')} {name!r} {neither}{did_you_mean(name, choices)}")
 
 
 def write_whole(file: Path, text: str) -> None:

@@ -67,8 +67,7 @@ def listen(flag: str, host: str, port: int, others: int = 0) -> socket.socket:
     Port 0: any that is free, which is also the last resort where there are `others`. `flag` names the option in the
     error. Raises PortError.
     """
-    further = [*range(port + 1, min(port + others, HIGHEST_PORT + 1)), 0] if port and others else []
-    ports = [port, *further]
+    ports = [*range(port, min(port + others, HIGHEST_PORT + 1)), 0] if port and others else [port]
     for each in ports:
         try:
             family, _, _, _, where = socket.getaddrinfo(host, each, type=socket.SOCK_STREAM)[0]

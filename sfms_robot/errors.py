@@ -27,6 +27,7 @@ from typing import Final
 
 MOST_SAID: Final = 20  # problems of one source, so that nothing floods the log
 INTERRUPTED: Final = 130  # exit code of a command that Ctrl-C or SIGTERM ended, after the safe stop
+CHECKOUT: Final = Path(__file__).resolve().parent.parent  # if there is a pyproject.toml in it
 NOTE: Final = 25  # level of a log line that informs: shown as a plain line. A WARNING is something to act on.
 
 
@@ -187,8 +188,9 @@ def optional(feature: str) -> Iterator[None]:
         package = (error.name or "").split(".")[0]
         if package not in EXTRA_OF:
             raise
-        install = install_command(EXTRA_OF[package])
-        raise MissingExtra(f"{feature} needs {package}, which is not installed: {install}") from error
+        raise MissingExtra(
+            f"{feature} needs {package}, which is not installed: {install_command(EXTRA_OF[package])}"
+        ) from error
 
 
 def install_command(extra: str) -> str:
@@ -202,9 +204,8 @@ def install_command(extra: str) -> str:
     here, pip = Path.cwd(), "pip"
     if Path(which("pip") or "").parent != Path(sys.executable).parent:
         pip = f"{quote(_within(here, Path(sys.executable)))} -m pip"
-    checkout = Path(__file__).resolve().parent.parent
-    if (checkout / "pyproject.toml").is_file():
-        return f"{pip} install -e {quote(f'{_within(here, checkout)}[{extra}]')}"
+    if (CHECKOUT / "pyproject.toml").is_file():
+        return f"{pip} install -e {quote(f'{_within(here, CHECKOUT)}[{extra}]')}"
     return f"{pip} install {quote(f'sfms-robot[{extra}]')}"
 
 

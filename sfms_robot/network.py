@@ -92,7 +92,7 @@ def session_config(role: Role, router: Router = LOCAL) -> zenoh.Config:
             _check_secure(given, file)
         return given
     serves = role == "serve"
-    settings: dict[str, Any] = {
+    settings = {
         "mode": "router" if serves else "client",
         "scouting/multicast/enabled": False,
         "transport/link/tx/lease": LEASE_MS,
@@ -270,7 +270,7 @@ class Ros2Node:
         self._numbers = dict.fromkeys(self._sends, 0)
         self._gid = b"\x10" + secrets.token_bytes(16)
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._seen: set[tuple[str, str]] = set()  # topic and domain of publishers
+        self._seen = set[tuple[str, str]]()  # topic and domain of publishers
         self._said = Said()
         self._kept: list[Any] = []  # what is declared, for as long as the node lives
         config = session_config("call", router)
@@ -333,8 +333,7 @@ class Ros2Node:
             mangled = topic.replace("/", "%")
             token("MS", entity, mangled, wire, _QOS)
             # Of any type and hash: a wrong one is worth a line.
-            take = partial(self._take, topic)
-            self._kept.append(session.declare_subscriber(f"{self.domain}{topic}/*/*", take))
+            self._kept.append(session.declare_subscriber(f"{self.domain}{topic}/*/*", partial(self._take, topic)))
             others, note = f"@ros2_lv/*/*/*/*/MP/*/*/*/{mangled}/**", partial(self._note_publisher, topic)
             self._kept.append(live.declare_subscriber(others, note, history=True))
 

@@ -56,8 +56,8 @@ def plug_in(entry: EntryPoint, *arguments: Any, **more: Any) -> Any:
 
 def plugin_error(entry: EntryPoint, problem: str) -> ConfigError:
     """Return the error that names the plug-in, its package and what is wrong with it."""
-    package = entry.dist.name if entry.dist else "unknown"
-    return ConfigError(f"plug-in {entry.name} (package {package}, {entry.value}): {problem}")
+    of = f"package {entry.dist.name if entry.dist else 'unknown'}, {entry.value}"
+    return ConfigError(f"plug-in {entry.name} ({of}): {problem}")
 
 
 def listener_folder(name: str) -> Path | None:

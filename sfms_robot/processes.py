@@ -99,7 +99,7 @@ class Child:
             env={**os.environ, **ONE_THREAD, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )
         assert self.process.stdin is not None and self.process.stdout is not None
-        self._received: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._received = queue.SimpleQueue[Any]()
         self._take, self._most = take or self._keep, most
         self._alive = False
         self.dropped = 0
@@ -189,8 +189,8 @@ class PipeWriter:
 
     def __init__(self, pipe: IO[bytes], kept: int, name: str) -> None:
         self._pipe = pipe
-        self._sent: deque[bytes] = deque()
-        self._offered: deque[bytes] = deque(maxlen=kept)
+        self._sent = deque[bytes]()
+        self._offered = deque[bytes](maxlen=kept)
         self._rest = memoryview(b"")  # of a message of which the pipe has taken the beginning
         self._writing = threading.Lock()
         self._full = False  # set by the thread that writes, cleared by the one that waits for room
@@ -328,7 +328,7 @@ class Supervised:
         self._time_s = self._silent_s = self._restart_at_s = 0.0
         self._pause_s = limits.pause_s
         self._failed = False  # and has not been steady since
-        self._restarted_s: deque[float] = deque()
+        self._restarted_s = deque[float]()
 
     @property
     def away(self) -> bool:

@@ -44,23 +44,20 @@ class HeadLink:
     def __init__(self, robot: Robot, way: str) -> None:
         self._robot, self._way = robot, way
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._named: set[tuple[str, str]] = set()
-        self.refused: Counter[str] = Counter()
+        self._named = set[tuple[str, str]]()
+        self.refused = Counter[str]()
 
     def hear(self, pcm: bytes, rate_hz: float, channels: int = 1) -> None:
         """Hand over what the person says now, 16-bit little-endian, channels interleaved. Never blocks or raises."""
-        self._hand_over("voice", self._robot.hear, pcm, rate_hz, channels)
+        self._hand_over("voice", lambda: self._robot.hear(_mono(pcm, channels), rate_hz))
 
     def say(self, pcm: bytes, rate_hz: float, channels: int = 1) -> None:
         """Hand over what the agent says next, as `hear`."""
-        self._hand_over("speech", self._robot.say, pcm, rate_hz, channels)
+        self._hand_over("speech", lambda: self._robot.say(_mono(pcm, channels), rate_hz))
 
     def hush(self) -> None:
         """Drop the speech that still waits."""
-        try:
-            self._robot.hush()
-        except RobotError as error:  # this robot does not listen to programs
-            self.problem("speech", error)
+        self._hand_over("speech", self._robot.hush)
 
     def on(self, kinds: Sequence[str], take: Callable[[ListenerEvent], object]) -> None:
         """Call `take` in the event loop with each event of `kinds`, from `open` until `close`.
@@ -97,12 +94,10 @@ class HeadLink:
             self._named.add(found)
             log.warning("%s: %s: %s (said once)", self._way, *found)
 
-    def _hand_over(
-        self, what: str, take: Callable[[bytes, float], None], pcm: bytes, rate_hz: float, channels: int
-    ) -> None:
+    def _hand_over(self, what: str, hand_over: Callable[[], None]) -> None:
         try:
-            take(_mono(pcm, channels), rate_hz)
-        except RobotError as error:
+            hand_over()
+        except RobotError as error:  # of bad sound, or of a robot that does not listen to programs
             self.problem(what, error)
 
 

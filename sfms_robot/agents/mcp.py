@@ -59,7 +59,7 @@ class HeadPage:
     async def status(self) -> dict[str, Any]:
         """Return what the head is, what it can show, and how the run is going. Raises RobotError."""
         async with self._connected() as (socket, hello):
-            known: dict[str, Any] = {key: hello.get(key) for key in ("head", "listener", "over")}
+            known = {key: hello.get(key) for key in ("head", "listener", "over")}
             known["channels"], known["expressions"] = hello.get("channels"), sorted(hello.get("expressions") or {})
             if not hello.get("over"):
                 known |= (await _next(socket, "status"))["status"]

@@ -204,8 +204,7 @@ def run(
         if options.fleet is not None:
             from sfms_robot.app.fleet import FleetControls, FleetHead, fleet_key
 
-            reach = FleetControls(controls, options.fleet, fleet_key(options.fleet_key))
-            watch(FleetHead(reach, options.router))
+            watch(FleetHead(FleetControls(controls, options.fleet, fleet_key(options.fleet_key)), options.router))
         played: Report = {"timeline": timeline}
         if timeline is None:
             played = {"life": HeadLife(head.life, options.seed, head.camera), "answers": True}

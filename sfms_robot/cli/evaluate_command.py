@@ -18,6 +18,7 @@ Part = Literal["train", "validation", "test"]  # of meetings and voices (`corpor
 Unseen = Literal["validation", "test"]
 LISTENER = Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 SPLIT = Option("test", help="Dyads: test to report, validation to choose.")
+JOBS = Option(None, min=1, help="Processes; as many as there are cores.")
 SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
 ENGINE_HELP = "Engine of the listener; its precision is that of its config.yaml."
 _INTERVALS = "in brackets: 95 % intervals over people. Rows of the paper are from other data: compare ratios."
@@ -163,7 +164,7 @@ def timing(
     ),
     seeds: int = Option(8, min=1, help="Number of times that each meeting is played."),
     seed: int = SEED,
-    jobs: int | None = Option(None, min=1, help="Processes; as many as there are cores."),
+    jobs: int | None = JOBS,
     hop: int | None = HOP,
     engine: str = Option("torch", metavar="auto|onnx|torch", help=ENGINE_HELP),
     own_voice: bool = Option(False, "--own-voice", help="It speaks when the person did; else it never does."),
@@ -187,9 +188,8 @@ def timing(
         engine=engine_named(engine),
         own_voice=own_voice,
     )
-    found = evaluate_timing(options)
     show(
-        found,
+        evaluate_timing(options),
         json,
         heading="{people} people of {split}, {meetings} meetings, {minutes} minutes, {seeds} seeds",
         keys=("rows", "detector", "asked_and_seen", "notes"),
@@ -208,7 +208,7 @@ def robustness(
     minutes: float = Option(1.0, min=0.1, help="Of each, in each way."),
     seeds: int = Option(8, min=1, help="Number of times that each is played."),
     seed: int = SEED,
-    jobs: int | None = Option(None, min=1, help="Processes; as many as there are cores."),
+    jobs: int | None = JOBS,
     json: bool = JSON,
 ) -> None:
     """Events a minute with unseen speakers: voice, face and both, in noise, rooms and bad pictures."""

@@ -107,8 +107,7 @@ def check(
 def _print_check(checked: Result) -> None:
     """Print the verdict, the problems and remarks, one line each; without problems, the table of the joints."""
     problems, remarks = checked["problems"], checked["remarks"]
-    found = ((problems, "problem"), (remarks, "remark"))
-    numbers = [counted(len(each), name) for each, name in found if each]
+    numbers = [counted(len(each), name) for each, name in ((problems, "problem"), (remarks, "remark")) if each]
     verdict = "not fit to run" if problems else "fit to run"
     say(f"{checked['name']}: {', '.join([verdict, *numbers])}", "bold red" if problems else "bold")
     for line in (*problems, *remarks):
@@ -163,9 +162,8 @@ def show_head(
     if urdf is not None:
         from sfms_robot.app.head.head_scene import draw_scene
 
-        drawn = draw_scene(name, checked_png(urdf, "--urdf"), packages)
         show(
-            drawn,
+            draw_scene(name, checked_png(urdf, "--urdf"), packages),
             json,
             heading="{name}: {urdf}, drawn as {picture}",
             note="follows: joint of the head, joint of the URDF",

@@ -186,7 +186,7 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
 
 def _completed(words: Sequence[str]) -> list[str]:
     """Return the words, with a value after each option that may be given without one and is."""
-    completed: list[str] = []
+    completed = []
     for word, following in zip(words, [*words[1:], "-"], strict=False):
         completed.append(word)
         if word in run_command.OPTIONAL and following.startswith("-"):

@@ -321,8 +321,10 @@ def _print_demo(found: Result) -> None:
     """Print what a demo showed, or the statistics of several seeds."""
     if "runs" in found:
         nods = found["nods"]
-        scatter = f"variance over mean {cell(nods['variance_over_mean'])}"
-        print(f"nods: {nods['mean']:g} in the mean, {scatter}, {nods['seeds_without']} seeds without")
+        print(
+            f"nods: {nods['mean']:g} in the mean, variance over mean {cell(nods['variance_over_mean'])}, "
+            f"{nods['seeds_without']} seeds without"
+        )
         return
     print(_line(found))
     print(f"look at {' and '.join(found['pictures'])}" if found["pictures"] else f"recorded in {found['folder']}")

@@ -73,7 +73,7 @@ def scan(
 @with_shared_options
 def ping(on: Wiring, ids: str = IDS) -> None:
     """Check that servos answer, and show their models."""
-    rows: list[Row] = []
+    rows = []
     with on.open() as wire:
         for servo in progress.tracked(single_servo.checked_ids(ids), "asking"):
             try:
@@ -163,9 +163,8 @@ def doctor(
     from sfms_robot.app.servo.doctor import examine
     from sfms_robot.cli.show_servo import print_doctor
 
-    confirm = confirmation(yes) if fix else None
     with progress.bar("looking", hidden=json or fix) as step:
-        report = examine(port, head, family, baud, step, confirm)
+        report = examine(port, head, family, baud, step, confirmation(yes) if fix else None)
     show(report, json, print_doctor)
 
 
@@ -324,7 +323,7 @@ def confirmation(yes: bool, ids: str = "") -> Callable[[str], bool]:
     With several `ids` one yes holds for the same change to all of them; else each is asked.
     """
     alike = f" and the same for all of {ids}" if len(ids) > 1 and not ids.isdigit() else ""
-    said: list[bool] = [True] if yes else []
+    said = [True] if yes else []
 
     def ask(question: str) -> bool:
         if said:

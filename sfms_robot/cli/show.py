@@ -12,6 +12,7 @@ import os
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import wraps
 from importlib import import_module
 from itertools import chain
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 Result = Mapping[str, Any]  # of a command: what --json prints
-Row = Mapping[str, Any]  # of a table
+Row = Result  # of a table
 
 JSON = Option(False, "--json", help="Print the result as one JSON object, the last line of stdout.")
 _UNBROKEN = 1_000  # columns: wider than any table
@@ -52,14 +53,14 @@ _WORDS = {
 }  # keys of results that are printed in other words; of any other key the underscores become spaces
 
 
+@dataclass(frozen=True)
 class Later:
     """A module that is imported when one of its names is first used."""
 
-    def __init__(self, module: str) -> None:
-        self._module = module
+    module: str
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(import_module(self._module), name)
+        return getattr(import_module(self.module), name)
 
 
 def show(

@@ -26,15 +26,16 @@ app = Typer(help="Train a listener: its tokenizer, its predictor; and when it do
 data_app = Typer(help="Training data: compose dyads, check and convert data sets.", no_args_is_help=True)
 
 _SHOWN = 3  # names of a problem; --json has them all
-_LAYOUTS = (
-    "composed, l2l, lm_listener, react, react2025, dualtalk, dualtalk_arkit, dim, vico, seamless; "
-    "default: found automatically."
-)
 
 
 Order = Literal["exp-first", "pose-first"]
 CONFIG = Option(..., help="A configs/training/*.yaml, or your own.")
 ORDER = Option(None, help="Order of the channels in the files; default: the layout's own.")
+LAYOUT = Option(
+    "auto",
+    help="composed, l2l, lm_listener, react, react2025, dualtalk, dualtalk_arkit, dim, vico, seamless; "
+    "default: found automatically.",
+)
 
 
 # --- train ------------------------------------------------------------------------------------------------------------
@@ -199,7 +200,7 @@ def compose(
 @data_app.command()
 def check(
     folder: Path = Argument(..., metavar="DIR", help="A data set, as its authors lay it out."),
-    layout: str = Option("auto", help=_LAYOUTS),
+    layout: str = LAYOUT,
     order: Order | None = ORDER,
     window: int = Option(0, min=0, help="Frames that a clip must have."),
     channels: bool = Option(False, "--channels", help="Show the range of every channel."),
@@ -216,7 +217,7 @@ def check(
 def convert(
     folder: Path = Argument(..., metavar="IN", help="A data set, as its authors lay it out."),
     out: Path = Argument(..., metavar="OUT", help="Folder to write dyads into; must be empty or not there."),
-    layout: str = Option("auto", help=_LAYOUTS),
+    layout: str = LAYOUT,
     order: Order | None = ORDER,
     flame_matrix: Path | None = Option(
         None, help="FLAME coefficients of every ARKit blendshape (.npy, .csv): shows the expression of deca56 data."
@@ -225,8 +226,7 @@ def convert(
     json: bool = JSON,
 ) -> None:
     """Convert a data set into dyads at 25 fps in our own space, and report the loss."""
-    converted = data_commands.convert_data(folder, out, layout, order, flame_matrix, flame_order)
-    show(converted, json, _print_conversion)
+    show(data_commands.convert_data(folder, out, layout, order, flame_matrix, flame_order), json, _print_conversion)
 
 
 def _print_conversion(report: Result) -> None:

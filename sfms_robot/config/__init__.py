@@ -36,7 +36,6 @@ from sfms_robot.config.listener import (
     Sfms,
     SmileCourse,
     load_listener,
-    parse_listener,
 )
 from sfms_robot.data import find
 
@@ -105,7 +104,6 @@ __all__ = [
     "load_training",
     "map_files",
     "parse",
-    "parse_listener",
     "parse_training",
     "variant",
 ]

@@ -161,7 +161,7 @@ for _tag, _pattern, _first in (
 
 
 def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    seen: set[Any] = set()
+    seen = set[Any]()
     for key_node, _ in node.value:
         key = loader.construct_object(key_node)
         if key in seen:

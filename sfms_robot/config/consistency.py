@@ -72,8 +72,10 @@ def _drives(head: Any) -> Problems:
         for node in tree.nodes():
             if node.use and node.use not in head.expressions:
                 choices = "; ".join(filter(None, (", ".join(head.expressions), ", ".join(CHANNEL_INDEX))))
-                meant = did_you_mean(node.use, [*head.expressions, *CHANNEL_INDEX])
-                yield f"{where}: {node.use!r} is not a channel, nor an expression of this head ({choices}){meant}"
+                yield (
+                    f"{where}: {node.use!r} is not a channel, nor an expression of this head ({choices})"
+                    f"{did_you_mean(node.use, [*head.expressions, *CHANNEL_INDEX])}"
+                )
     for name, joint in head.joints.items():
         if (twin := joint.mirror_of) is None:
             continue

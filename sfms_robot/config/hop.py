@@ -84,17 +84,16 @@ class Latencies:
         lost = []
         short_s, p50_s, p95_s = self.lead_s - self.left_s(hop), self.p50_s(hop), self.p95_s(hop)
         if short_s > _EPS_S:
-            cut_ms = min(short_s, self.lead_s) * 1e3
-            lost.append(f"the slowest joint moves up to {cut_ms:.0f} ms late")
+            lost.append(f"the slowest joint moves up to {min(short_s, self.lead_s) * 1e3:.0f} ms late")
         if p50_s > P50_S + _EPS_S or p95_s > P95_S + _EPS_S:
             lost.append(
                 f"a sound is answered after {p50_s * 1e3:.0f} ms, 1 of 20 after {p95_s * 1e3:.0f} ms or more"
                 f" (wanted: {P50_S * 1e3:.0f} and {P95_S * 1e3:.0f})"
             )
         if not self.keeps_up(hop):
-            p50_ms, p99_ms, hop_ms = self.step_p50_s * 1e3, self.step_p99_s * 1e3, hop * FRAME_S * 1e3
             lost.append(
-                f"a plan takes {p50_ms:.0f} ms, 1 of 100 {p99_ms:.0f} ms or more, and is needed every {hop_ms:.0f} ms"
+                f"a plan takes {self.step_p50_s * 1e3:.0f} ms, 1 of 100 {self.step_p99_s * 1e3:.0f} ms or more, "
+                f"and is needed every {hop * FRAME_S * 1e3:.0f} ms"
             )
         return lost
 
@@ -131,14 +130,13 @@ def choose_hop(hops: Sequence[int], measured: Latencies) -> HopChoice:
     fitting = [hop for hop in hops if measured.fits(hop)]
     otherwise = min((hop for hop in hops if measured.keeps_up(hop)), default=max(hops))
     hop = max(fitting, default=otherwise)
-    cut_s = min(max(measured.lead_s - measured.left_s(hop), 0.0), measured.lead_s)
     budget_s = {
         "horizon": measured.horizon * FRAME_S,
         "hop": hop * FRAME_S,
         "source": measured.source_s,
         "step": measured.step_p99_s,
         "lead": measured.lead_s,
-        "lead_cut": cut_s,
+        "lead_cut": min(max(measured.lead_s - measured.left_s(hop), 0.0), measured.lead_s),
         "tick": measured.tick_s,
         "sound_to_goal_p50": measured.p50_s(hop),
         "sound_to_goal_p95": measured.p95_s(hop),

@@ -268,8 +268,7 @@ class Sfms(ListenerSettings):
         for name, group in self.groups.items():
             for channel in group.channels:
                 if channel not in self.drawn_channels:
-                    choices = ", ".join(self.drawn_channels)
-                    yield f"groups.{name}.channels: {channel!r} is not a channel ({choices})"
+                    yield f"groups.{name}.channels: {channel!r} is not a channel ({', '.join(self.drawn_channels)})"
                 if owner.setdefault(channel, name) != name:
                     yield f"groups.{name}.channels: {channel!r} is already in group {owner[channel]}"
         missing = [channel for channel in self.drawn_channels if channel not in owner]

@@ -121,8 +121,8 @@ class Training(Model):
     def contradictions(self) -> Problems:
         for name in self.predictor.group_weights:
             if name not in self.listener.groups:
-                choices = ", ".join(self.listener.groups)
-                yield f"predictor.group_weights: {name!r} is not a group of the listener ({choices})"
+                groups = ", ".join(self.listener.groups)
+                yield f"predictor.group_weights: {name!r} is not a group of the listener ({groups})"
 
 
 class Stage(Model):

@@ -91,5 +91,4 @@ class Furhat(WebSocketOutput):
         self._configure(own=True)
 
     def _configure(self, own: bool) -> None:
-        config = {"type": "request.face.config", **dict.fromkeys(_OWN, own)}
-        self.say(config)
+        self.say({"type": "request.face.config", **dict.fromkeys(_OWN, own)})

@@ -99,7 +99,7 @@ class JsonStream(ServerThread, Output):
         super().__init__("--output json", LOOPBACK, port, 2 * _STOP_S)
         self.peer = address_text(*self.address)
         self._counts = dict.fromkeys(("refused", "missed"), 0)
-        self._clients: set[ServerConnection] = set()  # open; for the server's thread
+        self._clients = set[ServerConnection]()  # open; for the server's thread
         self._opening: dict[ServerConnection, None] = {}  # oldest first
 
     def open(self) -> None:
@@ -111,9 +111,8 @@ class JsonStream(ServerThread, Output):
     def send(self, frame: OutputFrame, now_s: float) -> None:
         """Send a frame to each client that reads."""
         if self._clients:
-            message = json_of(frame).decode()
             with suppress(RuntimeError):  # closed
-                self._loop.call_soon_threadsafe(self._send, message)
+                self._loop.call_soon_threadsafe(self._send, json_of(frame).decode())
 
     def statistics(self) -> Facts:
         """Return connected clients, refused ones, and frames that slow ones missed."""

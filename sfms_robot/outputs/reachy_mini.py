@@ -194,8 +194,8 @@ class ReachyMini(ReachyDaemon):
 
     def __init__(self, address: str = "") -> None:
         super().__init__(address)
-        self._sent: deque[tuple[float, float]] = deque(maxlen=_HISTORY)
-        self._reported: deque[tuple[float, float]] = deque(maxlen=_HISTORY)
+        self._sent = deque[tuple[float, float]](maxlen=_HISTORY)
+        self._reported = deque[tuple[float, float]](maxlen=_HISTORY)
         self._goal = np.eye(4)  # sent last
         self._together_s: float | None = None  # when the head was last seen near it
 

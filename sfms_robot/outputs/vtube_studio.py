@@ -167,8 +167,7 @@ class VtubeStudio(WebSocketOutput):
 
     def _authenticate(self, token: str) -> None:
         self._asked_s = self.link.heard_s
-        data = {**PLUGIN, "authenticationToken": token}
-        self.say(_request("Authentication", data))
+        self.say(_request("Authentication", {**PLUGIN, "authenticationToken": token}))
 
     def _token(self) -> str | None:
         try:

@@ -11,9 +11,9 @@ import errno
 import logging
 import socket
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from typing import Any, Final
+from typing import Final
 
 import orjson
 from websockets.client import ClientProtocol
@@ -27,7 +27,7 @@ from sfms_robot.errors import OutputError, Said
 from sfms_robot.outputs.registry import parse_address
 from sfms_robot.ports import Facts, Output, OutputFrame
 
-Message = Mapping[str, Any]
+Message = Facts
 
 CONNECT_S: Final = 1.0
 SILENT_S: Final = 2.0
@@ -162,8 +162,8 @@ class WebSocketPeer:
                     self.heard_s = time.monotonic()
         if (problem := self._protocol.handshake_exc) is not None:
             answer = f"HTTP {problem.response.status_code}" if isinstance(problem, InvalidStatus) else "other bytes"
-            path = self._protocol.uri.path
-            raise OutputError(f"the program that listens there has no WebSocket at {path}: it answers {answer}")
+            where = f"the program that listens there has no WebSocket at {self._protocol.uri.path}"
+            raise OutputError(f"{where}: it answers {answer}")
         if self._protocol.parser_exc is not None:
             raise OutputError("answers with bytes that are not of a WebSocket")
         if self._protocol.close_rcvd is not None:
@@ -204,8 +204,7 @@ def _parsed(data: bytes) -> Message:
     with suppress(orjson.JSONDecodeError):
         if isinstance(message := orjson.loads(data), dict):
             return message
-    quoted = data[:_MOST_QUOTED].decode("utf-8", "replace")
-    raise OutputError(f"answers with {quoted!r}, which is not a JSON object")
+    raise OutputError(f"answers with {data[:_MOST_QUOTED].decode('utf-8', 'replace')!r}, which is not a JSON object")
 
 
 class WebSocketOutput(Output):

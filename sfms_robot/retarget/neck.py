@@ -8,14 +8,14 @@ pitch and roll together to a differential. Translation is not for such a neck: a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
 from typing import Final
 
 import numpy as np
 
-from sfms_robot.config.kinematics import SerialNeck, Split
+from sfms_robot.config.kinematics import SerialNeck
 from sfms_robot.frames import Bools, Doubles
 from sfms_robot.ranges import Range
 from sfms_robot.signals import rotations
@@ -83,12 +83,12 @@ class Serial:
     turns_body = False
 
     def __init__(self, config: SerialNeck, ranges: Ranges) -> None:
-        self.joints: Sequence[str] = config.joints()
-        self.axes: Sequence[str] = config.order
+        self.joints = config.joints()
+        self.axes = config.order
         self._axes = tuple(rotations.AXIS[name] for name in config.order)
         self._range = Range(*np.array([ranges[name] for name in self.joints]).T)
         column = {name: column for column, name in enumerate(self.joints)}
-        self._splits: list[tuple[int, Split, Range, list[int]]] = []  # row of the axis, range and columns of its joints
+        self._splits = []  # row of the axis, range and columns of its joints
         # Angles of the axes (..., k) @ goals = those of the joints (..., J), without their limits; and the reverse.
         goals = np.zeros((len(self._axes), len(self.joints)))
         for row, place in enumerate(map(config.axes.get, config.order)):
@@ -128,8 +128,7 @@ class Serial:
 
     def step(self, pose: Doubles, dt_s: float, memory: Doubles) -> tuple[Doubles, Doubles]:
         """Return the joints (J,) for one pose (6,) after `dt_s`, and the memory after it."""
-        wanted = checked(pose)
-        angles, slow = self._axis_angles(wanted), memory.copy()
+        angles, slow = self._axis_angles(checked(pose)), memory.copy()
         for row, place, *_ in self._splits:
             if place.crossover_hz is not None:
                 slow[row] = low_pass(angles[row], memory[row], place.crossover_hz, dt_s)

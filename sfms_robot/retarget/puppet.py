@@ -124,7 +124,7 @@ class Puppet:
         self._head_share = np.where(stiff, 0.0, np.where(eyeless, 1.0, HEAD_SHARE))
         self._gain = np.where(stiff, 0.0, gaze.neck_gain)
         # Commands since the last tick: a face (58,), its channels, seconds; or a direction (2,), None, seconds.
-        self._asked: deque[tuple[Doubles, Bools | None, float]] = deque()
+        self._asked = deque[tuple[Doubles, Bools | None, float]]()
         shown = Request(rise_s=RISE_S, fall_s=FALL_S, change_s=CHANGE_S, smooth=False)
         eyes = Request(rise_s=EYES_S, fall_s=FALL_S, change_s=EYES_S)
         head = Request(rise_s=HEAD_S, fall_s=HEAD_S, change_s=HEAD_S)
@@ -155,8 +155,7 @@ class Puppet:
         if len(self._pieces) == 1 and self._pieces[0].over_s <= earliest_s:
             return motion
         out = motion.copy()
-        starts = [piece.since_s for piece in self._pieces]
-        which = np.searchsorted(starts, times_s, side="right") - 1
+        which = np.searchsorted([piece.since_s for piece in self._pieces], times_s, side="right") - 1
         for index, piece in enumerate(self._pieces):
             rows = np.flatnonzero(which == index)
             if len(rows):

@@ -18,7 +18,6 @@ the same cranks would fit but the head could only have fallen there.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Final
@@ -154,10 +153,10 @@ class Platform:
 class Stewart:
     """A Stewart platform, with the methods of every neck (`neck.Serial`). The memory is the low-passed yaw, (1,)."""
 
-    axes: Sequence[str] = POSE_CHANNELS
+    axes = POSE_CHANNELS
 
     def __init__(self, config: StewartPlatform, ranges: Ranges) -> None:
-        self.joints: Sequence[str] = config.joints()
+        self.joints = config.joints()
         self.geometry = Platform.of(config)
         self._body = config.body_yaw
         self._range = Range(*np.array([ranges[leg.joint] for leg in config.legs]).T)
@@ -182,8 +181,7 @@ class Stewart:
         """Return True (n,) for the poses (n, 6), seen from the body, that the platform can take."""
         cranks = self.geometry.inverse(poses, DEAD_CENTRE)
         fine = np.asarray(self._range.holds(cranks).all(axis=-1) & (np.abs(poses) <= self._lean).all(axis=-1))
-        stiff = self.geometry.stiffness(poses[fine], cranks[fine])
-        fine[fine] = stiff / self._home_stiffness >= MIN_STIFFNESS
+        fine[fine] = self.geometry.stiffness(poses[fine], cranks[fine]) / self._home_stiffness >= MIN_STIFFNESS
         return fine
 
     def solve(self, poses: Doubles, body_yaw_rad: Doubles | None = None) -> Solved:
@@ -208,8 +206,7 @@ class Stewart:
 
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
         body = angles_rad[..., 0] if self.turns_body else np.zeros(angles_rad.shape[:-1])
-        legs = angles_rad[..., -6:]
-        return rotations.seen_from(-body, self.geometry.forward(legs, rotations.seen_from(body, start)))
+        return rotations.seen_from(-body, self.geometry.forward(angles_rad[..., -6:], rotations.seen_from(body, start)))
 
     def _body_yaw(self, yaw_rad: Doubles, slow_rad: Doubles) -> Doubles:
         """Return the body's part (...) of the yaw (...): the slow one, and always the part beyond the platform's."""
@@ -223,8 +220,8 @@ class Stewart:
         shape = poses.shape[:-1]
         wanted = rotations.seen_from(body, poses).reshape(-1, 6)
         given, reached = self.nearest(wanted)
-        cranks = self._range.nearest(self.geometry.inverse(given))  # a border pose may round past its end
-        angles = cranks.reshape(*shape, 6)
+        # A border pose may round past its end.
+        angles = self._range.nearest(self.geometry.inverse(given)).reshape(*shape, 6)
         if self.turns_body:
             angles = np.concatenate([np.broadcast_to(body, shape)[..., None], angles], axis=-1)
         reached = reached.reshape(shape)

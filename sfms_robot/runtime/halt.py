@@ -27,6 +27,7 @@ import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
@@ -184,7 +185,7 @@ def resume_here(latch: HaltLatch) -> None:
 @contextmanager
 def _on_signal(number: int, act: Callable[[], None]) -> Iterator[None]:
     """Call `act` in a thread for every signal, while inside."""
-    came: SimpleQueue[bool] = SimpleQueue()  # reentrant: a handler may interrupt any code
+    came = SimpleQueue[bool]()  # reentrant: a handler may interrupt any code
 
     def work() -> None:
         while came.get():
@@ -275,17 +276,18 @@ def _watching(
         del latch.switches[name]
 
 
+@dataclass(frozen=True)
 class GpioLine:
     """A line of a GPIO chip as input; its file descriptor has an event to read at each edge."""
 
-    def __init__(self, fd: int, ioctl: Ioctl) -> None:
-        self.fd, self._ioctl = fd, ioctl
+    fd: int
+    ioctl: Ioctl
 
     def active(self) -> bool:
         """Read its level; a line that cannot be read counts as active."""
         values = bytearray(_VALUES.pack(0, 1))
         try:
-            self._ioctl(self.fd, _GET_VALUES, values)
+            self.ioctl(self.fd, _GET_VALUES, values)
         except OSError:
             return True
         return bool(_VALUES.unpack(values)[0] & 1)

@@ -339,8 +339,7 @@ def _as_ros2(topic: str, time_s: float, body: Facts, text: bytes) -> Iterator[tu
             yield "/robot_face/action_units", ros2.to_cdr(ros2.ACTION_UNITS, head | units)
             yield "/robot_face/expression", ros2.to_cdr(ros2.EXPRESSION, head | ros2.expression_of(units["intensity"]))
         case "/speaker":
-            sound = {"data": base64.b64decode(body["audio_pcm16"])}
-            yield "/audio", ros2.to_cdr(ros2.AUDIO, head | {"audio": sound})
+            yield "/audio", ros2.to_cdr(ros2.AUDIO, head | {"audio": {"data": base64.b64decode(body["audio_pcm16"])}})
         case "/state":
             state = ros2.diagnostics(head["header"], body["state"], {"why": ", ".join(body["why"])})
             yield "/diagnostics", ros2.to_cdr(ros2.DIAGNOSTICS, state)

@@ -41,9 +41,9 @@ StateName = Literal[
     "starting", "idle", "listening", "speaking", "degraded", "halted", "stopping", "stopped", "fault"
 ]  # fmt: skip
 
-RUNNING: Final[tuple[StateName, ...]] = ("idle", "listening", "speaking", "degraded")
-_MOVING: Final[tuple[StateName, ...]] = ("starting", *RUNNING)
-ARROWS: Final[frozenset[tuple[StateName, StateName]]] = frozenset(
+RUNNING: Final = ("idle", "listening", "speaking", "degraded")
+_MOVING: Final = ("starting", *RUNNING)
+ARROWS: Final = frozenset(
     [(a, b) for a in _MOVING for b in RUNNING if a != b]
     + [(a, "halted") for a in _MOVING]
     + [("halted", "starting")]
@@ -131,8 +131,7 @@ class Presence:
         if frame.agent_audio is not None and energy_db(frame.agent_audio) > SAYS_DB:
             watched = replace(watched, said_s=frame.time_s)
         if frame.face is not None:
-            seen_s = frame.face.time_s
-            watched = replace(watched, seen_s=seen_s, place_m=frame.place_m, attention=frame.attention)
+            watched = replace(watched, seen_s=frame.face.time_s, place_m=frame.place_m, attention=frame.attention)
         heard = len(frame.audio) > 0 and ear.active
         sensed = len(frame.audio) > 0 or frame.face is not None
         return Presence(

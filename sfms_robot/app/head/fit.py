@@ -129,12 +129,11 @@ def fit_head(name: str, recording: Path) -> Report:
     )
     layered(shipped, changed := overlay.replaced(fit=layer), sha256)  # refuses what is not sound
     save_overlay(changed, file)
-    both = {key: rms(np.array([row[key] for row in measured])) for key in ("before", "after")}
     return {
         "head": head.name,
         "frames": len(has),
         "delay_s": delay_s,
-        **both,
+        **{key: rms(np.array([row[key] for row in measured])) for key in ("before", "after")},
         "joints": rows,
         "file": str(file),
         "practice": practice,
@@ -142,7 +141,7 @@ def fit_head(name: str, recording: Path) -> Report:
 
 
 def _rows(head: Head, responses: Sequence[Response | None], has: Doubles, looks: Doubles) -> list[Report]:
-    rows: list[Report] = []
+    rows = []
     for joint, response, value, look in zip(head.joints, responses, has.T, looks.T, strict=True):
         row: Report = {"joint": joint, "moved": None, "before": None, "after": None}
         if response is not None:
@@ -174,8 +173,9 @@ def read_pairs(head: Head, folder: Path, run: RunRecording) -> tuple[Doubles, Fl
     at_s = times_s - delay_s
     inside = (at_s >= run.times_s[0]) & (at_s <= run.times_s[-1])
     if not inside.any():
-        ends = f"{run.times_s[0]:.1f}..{run.times_s[-1]:.1f} s"
-        raise ConfigError(f"{found[0]}: column time lies outside the run ({ends})")
+        raise ConfigError(
+            f"{found[0]}: column time lies outside the run ({run.times_s[0]:.1f}..{run.times_s[-1]:.1f} s)"
+        )
     return _at(at_s[inside], run.times_s, angles), shapes[inside], delay_s
 
 

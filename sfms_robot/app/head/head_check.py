@@ -229,7 +229,7 @@ def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> Report:
     faces: dict[str, list[Floats]] = {}
     for face, clip in named_faces(data):
         faces.setdefault(face, []).append(clip)
-    rows: list[Report] = []
+    rows = []
     skin = skin_motion()
 
     def energy(shapes: Doubles) -> float:
@@ -237,7 +237,7 @@ def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> Report:
 
     for head in map(load_head, tracked(names, "showing faces")):
         neck, tracker = HeadRetargeter(head).neck, Tracker(head)
-        sums: dict[str, Doubles] = {}  # seconds, expression lost and shown, pose lost and shown
+        sums = {}  # seconds, expression lost and shown, pose lost and shown
         for face, clips in faces.items():
             motion = np.concatenate(clips)
             wanted = motion[::_EVERY, SHAPES].astype(np.float64)

@@ -170,7 +170,7 @@ def _from_pypot(raw: Any, file: Path, name: str, model: str | None) -> Draft:
     remarks: list[str] = []
     buses: Report = {}
     joints: Report = {}
-    attached: set[str] = set()
+    attached = set[str]()
     for title, controller in robot.controllers.items():
         bus = _name(title, remarks)
         buses[bus] = {"family": f"dynamixel{controller.protocol}", "baud": controller.baudrate}
@@ -306,8 +306,9 @@ def _name(given: str, remarks: list[str]) -> str:
 
 def _finished(name: str, description: str, buses: Report, joints: Report, remarks: list[str]) -> Draft:
     """Return the head with a drive for each joint whose name stands for one channel that no other joint's does."""
+    words = {joint: set(re.split(r"[_\d]+", joint.lower().replace("head", "neck"))) for joint in joints}
     for channel, known in _CHANNELS.items():
-        named = [joint for joint in joints if _stands_for(known, joint)]
+        named = [joint for joint, has in words.items() if any(has.issuperset(each.split()) for each in known)]
         if len(named) == 1:
             joint = joints[named[0]]
             opens = 1 if joint["max_deg"] >= -joint["min_deg"] else -1  # a jaw opens to its longer side
@@ -330,8 +331,3 @@ def _finished(name: str, description: str, buses: Report, joints: Report, remark
         "life": {"idle": {}, "person": {}},
     }
     return head, remarks
-
-
-def _stands_for(known: tuple[str, ...], joint: str) -> bool:
-    words = set(re.split(r"[_\d]+", joint.lower().replace("head", "neck")))
-    return any(words.issuperset(word.split()) for word in known)

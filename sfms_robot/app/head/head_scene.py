@@ -37,8 +37,7 @@ def draw_scene(name: str, png: Path, packages: Sequence[str] = ()) -> Report:
 
     `packages` as for `scene_of`. Raises ConfigError, MissingExtra.
     """
-    head = load_head(name)
-    scene = scene_of(head, packages)
+    scene = scene_of(load_head(name), packages)
     from sfms_robot.face.drawing import render_robots
 
     render_robots(png, [("", scene, scene.rest())])

@@ -112,8 +112,7 @@ def free_folder(folder: Path) -> Path:
 
 def _summary(options: RunOptions, report: Report) -> Report:
     """Return what a person in front of the head would have seen."""
-    head = load_head(options.head, servos=False)
-    retargeter = HeadRetargeter(head)
+    retargeter = HeadRetargeter(load_head(options.head, servos=False))
     neck = [retargeter.joints[int(column)] for column in retargeter.neck_columns]
     travel_rad = sum(report["joints"][joint]["travel_rad"] for joint in neck if joint in report["joints"])
     return {

@@ -104,7 +104,7 @@ class _Screen:
     def __init__(self, console: Console, run: RunControls, keys: bool) -> None:
         self.help = False
         self.look = threading.Event()
-        self.lines: queue.SimpleQueue[logging.LogRecord] = queue.SimpleQueue()
+        self.lines = queue.SimpleQueue[logging.LogRecord]()
         self._console, self._run, self._keys = console, run, keys
         self._live = Live(
             console=console,

@@ -85,8 +85,7 @@ def _findings(found: Report) -> list[str]:
         findings.append("digital silence: it is muted, or another device is the right one (sfms-robot port list)")
     elif found["level_dbfs"] < QUIET_DB:
         findings.append(f"very quiet: no speech, or its gain is too low (speech is above {QUIET_DB:g} dBFS)")
-    elif found["level_dbfs"] - found["noise_floor_dbfs"] < NOISY_DB:
-        above = found["level_dbfs"] - found["noise_floor_dbfs"]
+    elif (above := found["level_dbfs"] - found["noise_floor_dbfs"]) < NOISY_DB:
         findings.append(f"speech is {above:.0f} dB above the noise, {NOISY_DB:g} are needed: nearer, or a quieter room")
     if found["clipped"] > MOST_CLIPPED:
         findings.append(f"{found['clipped']:.1%} of the samples clip: turn its gain down")

@@ -63,7 +63,7 @@ _EVENTS: Final = {"nod": "v", "blink": "|", "smile": "^"}
 _LEAST_LABEL: Final = 0.04  # of the width: a state that is shorter has its color alone
 
 # Signals of a face: the mean of channels, less the mean of others. The plot has a lane for each of the first six.
-_SIGNALS: Final[dict[str, Sequence[str]]] = {
+_SIGNALS: Final = {
     "blink": ("eyeBlinkLeft", "eyeBlinkRight"),
     "squint": ("eyeSquintLeft", "eyeSquintRight"),
     "gaze left +": ("eyeLookOutLeft", "eyeLookInRight"),
@@ -73,7 +73,7 @@ _SIGNALS: Final[dict[str, Sequence[str]]] = {
     "turn": ("yaw",),
     "tilt": ("roll",),
 }
-_LESS: Final[dict[str, Sequence[str]]] = {"gaze left +": ("eyeLookInLeft", "eyeLookOutRight")}
+_LESS: Final = {"gaze left +": ("eyeLookInLeft", "eyeLookOutRight")}
 _LANES: Final = list(_SIGNALS)[:6]
 # What a sheet writes below an instant: signal, direction, the least that counts (rad for turn and tilt), label.
 _LABELS: Final = (

@@ -171,7 +171,7 @@ def _records(file: Path) -> Iterator[tuple[str, Any]]:
 
     Of the format "ros2" the JSON texts are read; what ROS's own types repeat of them is left out.
     """
-    topics: dict[int, str | None] = {}
+    topics = {}
     in_ros2 = False
     ours = {name: topic for topic, name in ROS2_TOPICS.items()}
     with file.open("rb") as stream:

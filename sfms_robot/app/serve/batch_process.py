@@ -146,7 +146,7 @@ def _stepped(server: StreamServer) -> list[tuple[str, bytes]]:
 
 def _waiting(inbox: queue.SimpleQueue[Any], limit_s: float) -> list[Any]:
     """Return all messages that came; wait for the first one for so long."""
-    items: list[Any] = []
+    items = []
     try:
         if limit_s:
             items.append(inbox.get(timeout=limit_s))

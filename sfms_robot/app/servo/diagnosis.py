@@ -28,7 +28,7 @@ from sfms_robot.servo.stored_settings import Contradiction, JointNeeds, contradi
 
 Severity = Literal["error", "warning", "note"]
 
-SEVERITIES: Final[tuple[Severity, ...]] = ("error", "warning", "note")
+SEVERITIES: Final = ("error", "warning", "note")
 DEFAULT_RATE_HZ: Final = 100.0
 FAST_ENOUGH_MS: Final = 1
 _ROUND: Final = 0.95  # a bus that reaches this share of its rate reaches it
@@ -213,8 +213,9 @@ def judge_presence(line: Line, found: Iterable[FoundServo], baud: int, hint: str
         return
     for servo, want in line.wanted.items():
         if (seen := by_id.get(servo)) is None:
-            problem, look = "no answer, at any rate", line.servo("scan")
-            fix = f"check its cable; if it has another id: {look}, then {line.servo('set-id OLD NEW')}"
+            problem = "no answer, at any rate"
+            look = f"{line.servo('scan')}, then {line.servo('set-id OLD NEW')}"
+            fix = f"check its cable; if it has another id: {look}"
         elif seen.baud != baud:
             problem = f"set to {seen.baud} baud, the head says {baud}"
             fix = line.servo(f"set-baud {{id}} {baud}", seen.baud)
@@ -396,7 +397,6 @@ def judge_rate(budget: Report, line: Line, fast_works: bool | None = None) -> It
             "note", "bus", f"each servo read: {reached}; all in one answer, as a run does: {budget['fast']['hz']:.0f}"
         )
         return
-    set_baud = line.servo("set-baud ID RATE", budget["baud"])
     slow, _, fix = max(
         (
             "return delay",
@@ -407,8 +407,8 @@ def judge_rate(budget: Report, line: Line, fast_works: bool | None = None) -> It
         (
             "baud",
             usual["bytes"] * 10e3 / budget["baud"],
-            f"set servos and head file to a higher rate than {budget['baud']} baud: {set_baud}; "
-            "or lower rate_hz in the head's file",
+            f"set servos and head file to a higher rate than {budget['baud']} baud: "
+            f"{line.servo('set-baud ID RATE', budget['baud'])}; or lower rate_hz in the head's file",
         ),
         key=lambda cause: cause[1],
     )

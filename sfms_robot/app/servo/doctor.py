@@ -203,7 +203,7 @@ def _look(
     baud, found = _present(wire, line, progress)
     findings = list(judge_presence(line, found, baud, "" if found else protocol_hint(other_wires(wire))))
     fixed: list[str] = []
-    states: list[ServoState] = []
+    states = []
     for done, seen in enumerate(found):
         progress(done, len(found), f"id {seen.id}")
         wire.at(seen.baud)

@@ -65,7 +65,6 @@ def emulators(
     for option, texts in (("stored", stored), ("start", starts)):
         for text in texts:
             _change(option, text, wires.values())
-    specs = _faults(faults)
     with ExitStack() as stack:
         chains = {}
         for bus, servos in wires.items():
@@ -74,7 +73,7 @@ def emulators(
                 virtual,
                 timing=timing,
                 behind_silent=behind_silent,
-                faults=specs,
+                faults=_faults(faults),
                 seed=seed,
                 link=link if link is None or len(wires) == 1 else f"{link}-{bus}",
             )

@@ -85,7 +85,6 @@ class FoundServo:
 
     def row(self) -> Row:
         """Return the row of a report."""
-        note = "two servos with one id?" if self.twice else ""
         return {
             "id": self.id,
             "model": self.model,
@@ -94,7 +93,7 @@ class FoundServo:
             "firmware_minor": self.firmware_minor,
             "baud": self.baud,
             "family": self.wire.family,
-            "note": note,
+            "note": "two servos with one id?" if self.twice else "",
         }
 
     def block(self, address: int, length: int, what: str) -> Answer:
@@ -123,8 +122,10 @@ class FoundServo:
         """
         torque = None if mute else self.registers().role("torque_enable")
         if torque is not None and self.read(torque):
-            cure = self.wire.command(f"write {self.id} {torque.name} 0")
-            raise ServoError(f"id {self.id} has torque on, its EEPROM is closed: {cure}")
+            raise ServoError(
+                f"id {self.id} has torque on, its EEPROM is closed: "
+                f"{self.wire.command(f'write {self.id} {torque.name} 0')}"
+            )
         ask(f"id {self.id} ({self.model}): {what}", confirm)
 
 
@@ -222,8 +223,7 @@ class Wire:
 
     def has_duplicate(self, servo: int) -> bool:
         """Return whether two servos seem to have one id: each of several pings brings more than one clean answer."""
-        protocol = self.kind.protocol
-        return all(looks_double(self.port, protocol, servo, PATIENCE_S) for _ in range(TRIES))
+        return all(looks_double(self.port, self.kind.protocol, servo, PATIENCE_S) for _ in range(TRIES))
 
     def check_id(self, servo: int, what: str = "id") -> None:
         """Raise ConfigError for an id that no servo of the family can have."""
