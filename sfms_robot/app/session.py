@@ -166,7 +166,8 @@ def run(
         opened, person, feed = _open(options, controls, source, feed, stack)
         if feed is None:
             return {"version": 1, **facts, "exit": "done", "readings": opened.readings()}
-        log, joints = run_log(opened.config, opened.rate_hz), list(opened.config.joints)
+        log = run_log(opened.config, opened.rate_hz)
+        joints = log.joints
         from sfms_robot.outputs.sender import Outputs
 
         outputs = stack.enter_context(closing(Outputs(sinks, joints)))

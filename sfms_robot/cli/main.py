@@ -104,8 +104,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     verbose = [word for word in words if word in ("-v", "--verbose")]
     with _endings_as_interrupts():
         code, problem = _outcome(verbose + _completed([word for word in words if word not in verbose]))
-        if arguments is None:
-            _ignore_interrupts()
+        # After a command Ctrl-C would replace its exit code by that of a signal.
+        if arguments is None and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         if problem is not None and "--json" in words:
             ended = "interrupted" if code == INTERRUPTED else "failed"
@@ -115,12 +116,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
-
-
-def _ignore_interrupts() -> None:
-    """Ignore Ctrl-C after a command, which would replace its exit code by that of a signal."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 @contextmanager

@@ -89,7 +89,8 @@ class ServoChain(EmulatedDevice, Generic[S]):
                 for servo in (*listening.get(servo_id, ()), *followers.get(servo_id, ())):
                     servo.write(address, data, self._now_s)
         elif code in (dxl2.SYNC_READ, dxl2.FAST_SYNC_READ):
-            yield from self._reads(self._sync_reads(params), code)
+            address, length, ids = self._number(params, 0), self._number(params, 1), params[2 * self._width :]
+            yield from self._reads([(servo_id, address, length) for servo_id in ids], code)
         elif code in (dxl2.BULK_READ, FAST_BULK_READ):
             yield from self._reads(self._bulk_reads(params), code)
         elif target == dxl2.BROADCAST:
@@ -158,11 +159,6 @@ class ServoChain(EmulatedDevice, Generic[S]):
             length = self._number(params[1:], 1)
             yield params[0], self._number(params[1:], 0), params[5 : 5 + length]
             params = params[5 + length :]
-
-    def _sync_reads(self, params: bytes) -> list[Request[int]]:
-        """Return (id, address, length) of a sync read: address, length, then ids."""
-        address, length = self._number(params, 0), self._number(params, 1)
-        return [(servo_id, address, length) for servo_id in params[2 * self._width :]]
 
     def _common(self, servo: S, code: int, params: bytes) -> tuple[int, bytes, int] | None:
         """Return (error, data, status return level of the answer) of an instruction of every family; else None."""

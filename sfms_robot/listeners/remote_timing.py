@@ -124,7 +124,11 @@ class JitterBuffer:
             if self._given is not None:
                 self.lost += max(0, (number - self._given) // self._hop - 1)
             self._given = number
-            taken.append(self._shifted(self._waiting.pop(number)))
+            plan = self._waiting.pop(number)
+            if self.shift_s:
+                events = tuple(replace(event, start_s=event.start_s + self.shift_s) for event in plan.events)
+                plan = replace(plan, times_s=plan.times_s + self.shift_s, events=events)
+            taken.append(plan)
         return taken
 
     def restart(self, now_s: float) -> None:
@@ -147,12 +151,6 @@ class JitterBuffer:
         if self._given is None or number <= self._given + self._hop:
             return True
         return bool(now_s + MARGIN_S >= self._waiting[number].times_s[0] + self.shift_s)
-
-    def _shifted(self, plan: Plan) -> Plan:
-        if not self.shift_s:
-            return plan
-        events = tuple(replace(event, start_s=event.start_s + self.shift_s) for event in plan.events)
-        return replace(plan, times_s=plan.times_s + self.shift_s, events=events)
 
     def _follow(self, now_s: float) -> None:
         """Update the shift: up at once, down slowly."""

@@ -356,10 +356,7 @@ class StreamServer:
         """Return the number of streams of a batch that takes half of the deadline, all planning."""
         if self._capacity is None:
             return 1 << 16
-        size = 1
-        while self._capacity.batch_s(size + 1, 0) <= DEADLINE_S / 2 and size < 4096:
-            size += 1
-        return size
+        return next((size for size in range(1, 4096) if self._capacity.batch_s(size + 1, 0) > DEADLINE_S / 2), 4096)
 
     # --- figures -----------------------------------------------------------------------------------------------------
 

@@ -19,7 +19,6 @@ the same cranks would fit but the head could only have fallen there.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -123,7 +122,7 @@ class Platform:
         steps = max(int(np.ceil(np.abs(angles - before).max() / FOLLOW_RAD)), 1)
         pose = begin
         for cranks in before + np.arange(1, steps + 1)[:, None] / steps * (angles - before):
-            found = root(partial(self._excess_m, tips=self._tips(cranks)), pose, tol=TOLERANCE)
+            found = root(self._excess_m, pose, (self._tips(cranks),), tol=TOLERANCE)
             pose = np.asarray(found.x)
         same_side = self.stiffness(pose, angles) * self.stiffness(begin, before) > 0
         return pose if same_side and np.abs(found.fun).max() < ARRIVED_M else np.full(6, np.nan)

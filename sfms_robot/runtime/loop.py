@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from sfms_robot.errors import BusError
-from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, NEUTRAL, Bools, Doubles, Floats, Reading, Readings
+from sfms_robot.frames import CHANNEL_INDEX, CHANNELS, NEUTRAL, Bools, Doubles, Floats, Readings
 from sfms_robot.motion.limits import JerkLimiter, LimiterState, difference
 from sfms_robot.ports import Bus, Clock, Observer, PlanFeed, Retargeter, Source, Tick, Timeline
 from sfms_robot.retarget.spontaneous import HeadLife, LifeState
@@ -380,16 +380,17 @@ def _noticed(parts: Parts, readings: Readings, state: LoopState, now_s: float, p
         heat = parts.heat.after(heat, period_s)
     if not _due(now_s, period_s, LOOK_S):
         return replace(state, heat=heat) if heat is not state.heat else state
-    lost = tuple(joint for joint, reading in readings.items() if joint not in parts.ignored and _is_lost(reading))
+    lost = tuple(
+        joint
+        for joint, reading in readings.items()
+        if reading.fault is not None or (reading.position_rad is not None and reading.age_s > AWAY_S)
+        if joint not in parts.ignored
+    )
     if state.run.name == "halted" and any((readings[joint].fault or "").startswith(PINCH) for joint in lost):
         every = np.ones_like(state.released)
         _let_go(parts, every)
         state = replace(state, released=every, stands=True)
     return replace(state, heat=heat, lost_joints=lost)
-
-
-def _is_lost(reading: Reading) -> bool:
-    return reading.fault is not None or (reading.position_rad is not None and reading.age_s > AWAY_S)
 
 
 def _due(now_s: float, period_s: float, every_s: float) -> bool:

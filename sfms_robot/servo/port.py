@@ -141,7 +141,10 @@ class SerialPort:
         self._serial = _open(device, baud)
         try:
             self._io = serial_io(self._serial, device, rs485)
-            _low_latency(self._serial)
+            try:
+                self._serial.set_low_latency_mode(True)
+            except (AttributeError, NotImplementedError, OSError, ValueError) as error:
+                log.debug("%s: no low latency mode: %s", device, error)
             self.discard_input()
         except BaseException:
             _shut(self._serial)
@@ -348,13 +351,6 @@ def _check_baud(port: serial.Serial, device: str) -> None:
     actual = settings[_OUTPUT_SPEED] or port.baudrate
     if abs(actual - port.baudrate) > _BAUD_TOLERANCE * port.baudrate:
         raise PortError(f"{device}: the adapter cannot do {port.baudrate} baud (the nearest it has is {actual})")
-
-
-def _low_latency(port: serial.Serial) -> None:
-    try:
-        port.set_low_latency_mode(True)
-    except (AttributeError, NotImplementedError, OSError, ValueError) as error:
-        log.debug("%s: no low latency mode: %s", port.name, error)
 
 
 def _reason(device: str, error: Exception) -> str:

@@ -22,7 +22,6 @@ import fnmatch
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -368,7 +367,7 @@ def evaluate_table(
     compared = [fnmatch.filter(names, pattern) for pattern in only.split(",")]
     if not all(compared):
         raise ConfigError(f"--only {only}: expected patterns of tokenizers of this table (valid: {', '.join(names)})")
-    wanted = [one for name in dict.fromkeys(chain(*compared)) for one in seeded(name, seeds)]
+    wanted = [*dict.fromkeys(one for each in compared for name in each for one in seeded(name, seeds))]
     if missing := wanted if train else missing_in(folder, wanted, may_train=models is not None):
         examples = Windows.of(recorded["held_out"], 48).motion  # the length of every recipe, as in the paper
         train_all(missing, folder, recorded["train"], examples, size=size, steps=steps, jobs=jobs, again=train)

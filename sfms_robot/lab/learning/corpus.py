@@ -104,7 +104,7 @@ class Corpus(Generic[Frames]):
         def sent(part: Tensor) -> Tensor:
             found = windows(part, starts, window)
             # Only from pinned memory is a window sent while the next one is read.
-            return (found.pin_memory() if found.device.type != to.type else found).to(to, non_blocking=True)
+            return (found.pin_memory() if found.device != to else found).to(to, non_blocking=True)
 
         return _each(self.frames, sent)
 

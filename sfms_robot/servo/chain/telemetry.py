@@ -84,7 +84,11 @@ class Telemetry:
             _VOLTAGE: (voltages, _scales(voltages)),
             _TEMPERATURE: (temperatures, _scales(temperatures)),
         }
-        shared = {row: field for row, (fields, _) in sources.items() if (field := _shared(fields)) is not None}
+        shared = {  # registers that all servos have with the same address and form
+            row: first
+            for row, ((first, *others), _) in sources.items()
+            if first and all(_alike(field, first) for field in others)
+        }
         self._present = present, raw_type(present)
         self.position: Block = (present.address, present.size)
         self.block = span_of([present, *shared.values()])
@@ -185,11 +189,6 @@ def _alike(field: Field | None, other: Field | None) -> bool:
     """Return whether two registers have the same address and form."""
     first, second = (each and (each.address, each.size, each.signed, each.byte_order) for each in (field, other))
     return first == second
-
-
-def _shared(fields: Sequence[Field | None]) -> Field | None:
-    """Return the register that all servos have with the same address and form; None if there is none."""
-    return fields[0] if all(_alike(field, fields[0]) for field in fields) else None
 
 
 def _scales(fields: Sequence[Field | None], unit: str | None = None) -> Doubles:

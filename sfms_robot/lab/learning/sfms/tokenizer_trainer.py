@@ -140,7 +140,9 @@ def loss_of_steps(
                 wanted = torch.tensor(tokenizer.keyframes, device=batch.device)
                 off = torch.stack([(mask.sum(1) - wanted).abs().mean() for mask, _ in draws])
                 loss = loss + phase.sparsity * off.mean()
-            return loss + phase.mask_loss * torch.stack([masking(relaxed, target) for _, relaxed in draws]).mean()
+            # L1^mask of (13): relaxed k-hot masks against the mask of the best reconstruction drawn
+            missed = [(relaxed - target.detach()).abs().sum(1).mean() for _, relaxed in draws]
+            return loss + phase.mask_loss * torch.stack(missed).mean()
 
         return jointly
     draw, most = batches(tokenizer, motion, lengths, phase.steps * phase.batch), max(tokenizer.keyframes)
@@ -174,11 +176,6 @@ def reconstruction(
     keyframes = ((motion - at_keyframes) ** 2 * weight).sum() / weight.sum().clamp(min=1.0)
     steps = F.mse_loss(restored.diff(dim=1), motion.diff(dim=1))
     return F.mse_loss(restored, motion) + keyframes + velocity * steps
-
-
-def masking(relaxed: Tensor, best: Tensor) -> Tensor:
-    """Return L1^mask of (13): relaxed k-hot (B, T, G) against the mask of the best reconstruction drawn."""
-    return (relaxed - best.detach()).abs().sum(1).mean()
 
 
 def tokenizer_loss(
