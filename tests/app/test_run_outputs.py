@@ -134,6 +134,7 @@ def test_readers_of_two_outputs_see_the_face_of_the_run_and_a_halt_makes_it_neut
 
 
 @pytest.mark.realtime
+@pytest.mark.slow
 def test_a_receiver_that_is_away_is_said_once_and_named_by_the_state(caplog):
     report = run(replace(LIVE, duration_s=3.0, outputs=(f"vmc:{free_udp_port()}",)))
     (sent,) = report["outputs"]

@@ -15,6 +15,7 @@ def test_port_list_shows_serial_ports_and_what_records_and_plays(sound_server, c
     assert {row["name"]: row["description"] for row in listed["loudspeakers"]}["person"] == "--play person"
 
 
+@pytest.mark.slow
 def test_a_check_says_what_it_heard_of_nobody(sound_server, command_line):
     ended = command_line("run", "--audio", "mic:person", "--check", "--duration", "0.4", "--json")
     heard = ended.told

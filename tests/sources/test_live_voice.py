@@ -70,11 +70,8 @@ def offsets_s(frames, first):
 )  # fmt: skip
 @example(48000, 0.0, 0.003, 0.03, 95)
 def test_whatever_the_card_frames_are_in_their_time(rate_hz, ppm, piece_s, jitter_s, seed):
-    """From 5 s on: a stretch is first placed within 10 ms, and jitter of the first second fades by 1/e a second.
-
-    Where pieces are far shorter than the jitter nearly every callback waits for one before it, and a quarter of the
-    jitter is taken for the card's time.
-    """
+    """From 5 s on: a stretch is first placed within 10 ms, and jitter of the first second fades by 1/e a second."""
+    # Of pieces far shorter than the jitter nearly each waits for one before it: a quarter of the jitter stays.
     limit_s = max(0.005, jitter_s / 3) if jitter_s > 3 * piece_s else 0.005
     voice, frames = played(Card(rate_hz, ppm, jitter_s, seed), pieces(max(1, int(piece_s * rate_hz))), 20)
     assert not any(frame is None for frame in frames[3:]) and np.abs(offsets_s(frames, 125)).max() < limit_s

@@ -167,6 +167,7 @@ def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_ser
     assert any(frame.agent_audio is not None and frame.agent_audio.any() for frame in hearing.frames)
 
 
+@pytest.mark.slow
 def test_a_loudspeaker_is_heard_without_a_microphone_too(sound_server):
     with closing(open_source("none", "none", agent_audio="device:person.monitor", duration_s=60.0)) as source:
         hearing = Hearing(source, source._agent._recorder)

@@ -5,15 +5,7 @@ import pytest
 from scipy.stats import t as student_t
 from tiny_arig_training import dyad
 
-from sfms_robot.lab.evaluation.intervals import (
-    bootstrap,
-    distance,
-    estimates,
-    intervals,
-    people_of,
-    quotient,
-    ratio,
-)
+from sfms_robot.lab.evaluation.intervals import bootstrap, distance, estimates, intervals, people_of, quotient, ratio
 
 
 def people(rng, count=24, mean=2.0):

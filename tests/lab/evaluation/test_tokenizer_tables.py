@@ -15,12 +15,7 @@ from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError, ModelError
 from sfms_robot.lab.corpora.clips import read_takes
 from sfms_robot.lab.evaluation import tokenizer_tables
-from sfms_robot.lab.evaluation.table_tokenizers import (
-    TableModel,
-    keyframe_bits,
-    load_tokenizer,
-    save_tokenizer,
-)
+from sfms_robot.lab.evaluation.table_tokenizers import TableModel, keyframe_bits, load_tokenizer, save_tokenizer
 from sfms_robot.lab.evaluation.table_training import load_history, train
 from sfms_robot.lab.evaluation.tokenizer_tables import Windows, cluster, integrity, restoration_errors
 from sfms_robot.lab.learning.corpus import first_frames
