@@ -260,7 +260,7 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
 def run_log(head: Head, rate_hz: float) -> RunLog:
     """Return an empty log for `session.drive_head`, which audits commands by the head's limits."""
     audit = CommandAudit(JointLimits.of(head), calibration_of(head.joints), 1.0 / rate_hz)
-    return RunLog(joints=list(head.joints), period_s=1.0 / rate_hz, audit=audit)
+    return RunLog(list(head.joints), 1.0 / rate_hz, audit)
 
 
 def build_bus(

@@ -61,6 +61,8 @@ def tokenizer(
             raise BadParameter("--data is needed without --table")
         show(evaluate_tokenizer(listener, data, order, split), json)
         return
+    if split != "test":
+        raise BadParameter("--split validation: dyads have parts, tracks of --table are all held out")
     from sfms_robot.lab.evaluation.tokenizer_tables import evaluate_table
 
     found = interruptible(

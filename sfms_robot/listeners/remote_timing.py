@@ -120,7 +120,12 @@ class JitterBuffer:
         """Return plans whose turn it is, oldest first, with their times shifted."""
         self._follow(now_s)
         taken = []
-        while self._waiting and self._is_due(number := min(self._waiting), now_s):
+        while self._waiting:
+            number = min(self._waiting)
+            in_turn = self._given is None or number <= self._given + self._hop
+            # Out of turn once waiting longer for the one before is of no use.
+            if not in_turn and now_s + MARGIN_S < self._waiting[number].times_s[0] + self.shift_s:
+                break
             if self._given is not None:
                 self.lost += max(0, (number - self._given) // self._hop - 1)
             self._given = number
@@ -145,12 +150,6 @@ class JitterBuffer:
         self._delays_s.append(delay_s)
         late_s = float(np.percentile(self._delays_s, PERCENT))
         self._wanted_s = max(0.0, self._hop * FRAME_S + late_s + MARGIN_S - self._reach_s)
-
-    def _is_due(self, number: int, now_s: float) -> bool:
-        """Return whether it is the next in turn, or waiting longer for the one before is of no use."""
-        if self._given is None or number <= self._given + self._hop:
-            return True
-        return bool(now_s + MARGIN_S >= self._waiting[number].times_s[0] + self.shift_s)
 
     def _follow(self, now_s: float) -> None:
         """Update the shift: up at once, down slowly."""

@@ -121,6 +121,7 @@ CASES = [
     (TABLE + " 3 --train", 2, ["--train needs --models DIR"]),
     (TABLE + " 4 --data {tmp}/folder.png --models {tmp}/m", 2, ["no face tracks (*.csv, *.csv.gz) below it"]),
     ("evaluate tokenizer", 2, ["--data is needed without --table"]),
+    (f"{TABLE} 3 --split validation", 2, ["--split validation: dyads have parts"]),
     *((f"fleet {each} halt", 2, [f"fleet halt {each[:6]}"]) for each in ("--zenoh file.json5", "--json", "--insecure")),
 ]
 

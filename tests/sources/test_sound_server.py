@@ -160,7 +160,6 @@ def test_what_the_robot_says_is_taken_out_of_what_is_heard(hear, play, sound_ser
         ear.seconds(FRAME_S)
         hearing.seconds(FRAME_S)
     player.wait()
-    # Frame by frame: on a busy computer the sound server drops some, and the canceller needs a moment after each.
     settled = [[energy_db(frame.audio) for frame in one.frames[75:] if len(frame.audio)] for one in (ear, hearing)]
     levels = [np.median(decibels) for decibels in settled]
     assert levels[0] > -40.0 and levels[1] < levels[0] - 15.0
