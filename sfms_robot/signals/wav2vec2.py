@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from sfms_robot.errors import ModelError, optional
+from sfms_robot.errors import ModelError, first_line, optional
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats, Indices
 
 CONTEXT_FRAMES: Final = 50
@@ -47,7 +47,7 @@ class Wav2Vec2:
         try:
             model: Any = transformers.Wav2Vec2Model.from_pretrained(str(self.folder), local_files_only=True)
         except (OSError, ValueError, RuntimeError) as error:
-            raise ModelError(f"{self.folder}: no wav2vec2 weights that can be read: {error}".splitlines()[0]) from error
+            raise ModelError(f"{self.folder}: no wav2vec2 weights that can be read: {first_line(error)}") from error
         kernels, strides = model.config.conv_kernel, model.config.conv_stride
         if _reach(kernels, strides) != (FIELD, STRIDE):
             raise ModelError(f"{config}: conv_stride = {list(strides)} is not a latent every 20 ms")

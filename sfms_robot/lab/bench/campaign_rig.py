@@ -214,9 +214,15 @@ def plugged_in(
             open_port, family = port_of(chains[name], config, clock), family_named(config.family)
             more: dict[str, Any] = {"confirmed": True} if family.board else {"faults": head.faults}
             bus = family.build(
-                name, bus_servos(head, head.joints), calibration_of(head.joints), lambda: wrap(open_port()),
-                config.baud, _DEADLINE_S, config=config, **more,
-            )  # fmt: skip
+                name,
+                bus_servos(head, head.joints),
+                calibration_of(head.joints),
+                lambda: wrap(open_port()),
+                config.baud,
+                _DEADLINE_S,
+                config=config,
+                **more,
+            )
         try:
             yield Rig(head, chains, clock, bus)
         finally:

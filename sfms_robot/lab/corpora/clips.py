@@ -210,11 +210,15 @@ def read(file: Path) -> Dyad:
             if "events" in arrays:
                 optional["events"] = tuple(
                     ListenerEvent(
-                        kind, start_s, duration_s, size, swings,
+                        kind,
+                        start_s,
+                        duration_s,
+                        size,
+                        swings,
                         None if np.isnan(target).any() else tuple(target.tolist()),
                     )
                     for start_s, duration_s, size, kind, swings, target in arrays["events"].astype(_EVENT).tolist()
-                )  # fmt: skip
+                )
             return Dyad(
                 name=file.stem,
                 audio=voices.get("audio"),

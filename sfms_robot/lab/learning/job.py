@@ -47,7 +47,7 @@ from torch.distributed.rendezvous import rendezvous
 
 from sfms_robot import config
 from sfms_robot.app.progress import PlainBar, TimeLeft, console, rich_bar
-from sfms_robot.errors import ConfigError, GroupError, optional
+from sfms_robot.errors import ConfigError, GroupError, first_line, optional
 
 PATIENCE = timedelta(minutes=30)  # a process looks at held-out data, or stages files, while others wait
 
@@ -96,8 +96,7 @@ class ProcessGroup:
         except RuntimeError as error:  # gloo and NCCL raise this and its children
             if self.size == 1 or isinstance(error, torch.cuda.OutOfMemoryError):
                 raise
-            first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
-            said = f"process {self.rank} of {self.size} has lost another one: {first_line}"
+            said = f"process {self.rank} of {self.size} has lost another one: {first_line(error)}"
             raise GroupError(said) from error
 
 

@@ -28,7 +28,7 @@ from torch import Generator, Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from sfms_robot import config
-from sfms_robot.errors import ConfigError, GroupError, ModelError
+from sfms_robot.errors import ConfigError, GroupError, ModelError, first_line
 from sfms_robot.lab.learning.job import ALONE, Job, LossOf, Position, ProcessGroup, Report, Run, TrainingOutcome
 
 SMOOTHING = 0.98  # of the loss that is shown
@@ -432,8 +432,7 @@ def load_checkpoint(file: Path, job: Job, generator: Generator) -> tuple[Positio
         if job.device.type == "cuda" and "random.cuda" in tensors:
             torch.cuda.set_rng_state(tensors["random.cuda"], job.device)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        first = str(error).splitlines()[0]
-        raise ModelError(f"{file}: does not fit this version of the model: {first}") from error
+        raise ModelError(f"{file}: does not fit this version of the model: {first_line(error)}") from error
     return position, _under(tensors, "best.") or None
 
 
