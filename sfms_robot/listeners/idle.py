@@ -125,15 +125,11 @@ def draw_sway(
     size, phase = as_cosines(*factors)
     turns = np.broadcast_to(2 * math.pi * frequency_hz[..., None], size.shape)
     lines = np.stack([turns, size, phase]).reshape(3, bands * LINES, channels)
-    return np.concatenate([_clocks(uniform[-4:], channels, shifting)[:, None], lines], axis=1)
-
-
-def _clocks(uniform: Doubles, channels: int, shifting: Sequence[int]) -> Doubles:
-    """Return (3, S) of each channel's clock, of two that are drawn; `uniform` (4,): their lengths and phases."""
-    second = np.zeros(channels, np.intp)
-    second[list(shifting)] = 1
-    turn = 2 * math.pi / (CLOCK_S[0] + (CLOCK_S[1] - CLOCK_S[0]) * uniform[:2])
-    return np.stack([turn, UNEVEN / turn, 2 * math.pi * uniform[2:]])[:, second]
+    clock = np.zeros(channels, np.intp)  # of each channel: the first or the second
+    clock[list(shifting)] = 1
+    turn = 2 * math.pi / (CLOCK_S[0] + (CLOCK_S[1] - CLOCK_S[0]) * uniform[-4:-2])
+    clocks = np.stack([turn, UNEVEN / turn, 2 * math.pi * uniform[-2:]])[:, None, clock]
+    return np.concatenate([clocks, lines], axis=1)
 
 
 def sway_at(sway: Doubles, times_s: Reals) -> Floats:

@@ -40,6 +40,7 @@ from sfms_robot.frames import (
 )
 from sfms_robot.ports import Facts, Outlet, Sight, Source, Voice
 from sfms_robot.signals.attention import AttentionState, attend
+from sfms_robot.signals.events import CORNERS
 from sfms_robot.signals.face_units import beyond
 from sfms_robot.signals.quantiles import Quantiles
 from sfms_robot.sources.live_voice import Pace
@@ -49,8 +50,9 @@ logger = logging.getLogger(__name__)
 ALLOWANCE_S: Final = 0.04
 LONGEST_WAIT_S: Final = 0.15
 FACE_S: Final = 0.25  # a face that is older counts as lost
-_EPS_FRAMES: Final = 1e-6
-_EPS_S: Final = 1e-6
+SMILED_FRAMES: Final = 1500  # after a smile this long a listener takes it for how the face looks
+_SMILE: Final = 0.25
+_EPS: Final = 1e-6  # frames or seconds
 
 
 class PairedSource:
@@ -100,7 +102,7 @@ class PairedSource:
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
         """Return frames that are due by `now_s` and whole, or waited for long enough; oldest first. Never blocks."""
         until_s = now_s if self.duration_s is None else min(now_s, self.duration_s)
-        due = math.floor(until_s * FRAME_HZ + _EPS_FRAMES)
+        due = math.floor(until_s * FRAME_HZ + _EPS)
         frames: list[SpeakerFrame] = []
         while self._given < due:
             heard = self._heard(self._given, now_s)
@@ -148,7 +150,7 @@ class PairedSource:
             if own_voice is not None and self._says[0] <= index:
                 own_voice(index + 1, self._own_voice(index + 1))
             heard, self.latency_s = self._voice.take(index), self._voice.latency_s
-            if heard is None and waited_s < min(self.latency_s + ALLOWANCE_S, LONGEST_WAIT_S) - _EPS_S:
+            if heard is None and waited_s < min(self.latency_s + ALLOWANCE_S, LONGEST_WAIT_S) - _EPS:
                 return None
         self._wait_ms.add(waited_s * 1e3)
         if heard is None:
@@ -163,7 +165,7 @@ class PairedSource:
         sighting = None if self._sight is None else self._sight.at(seen_s)
         if sighting is not None:
             age_s = time_s - sighting.face.time_s
-            if age_s > FACE_S + _EPS_S:
+            if age_s > FACE_S + _EPS:
                 sighting = None
             else:
                 self._face_age_ms.add(max(0.0, age_s * 1e3))
@@ -223,6 +225,7 @@ class FrameJudge:
 
     def __init__(self) -> None:
         self.left_out = Counter[str]()
+        self._smiled = 0
         self._attending = AttentionState()
 
     def frame(self, index: int, heard: Floats, seen: Sighting | None, says: Floats | None) -> SpeakerFrame:
@@ -233,6 +236,9 @@ class FrameJudge:
         face = None if seen is None else self._face(index, seen.face)
         if seen is None or face is None:
             return SpeakerFrame(time_s, audio, None, own_audio)
+        self._smiled = self._smiled + 1 if face.motion[CORNERS].min() > _SMILE else 0
+        if self._smiled == SMILED_FRAMES:
+            logger.warning("source: the face has smiled for 60 s without a pause: it is not answered until it changes")
         place_m = self._finite(index, "place", seen.place_m, (3,))
         attention = seen.attention
         if attention is None or self._finite(index, "attention", attention, ()) is None:
@@ -255,7 +261,7 @@ class FrameJudge:
             self._leave_out(index, "face", problem)
             return None
         end_s = (index + 1) / FRAME_HZ
-        time_s = face.time_s if -FACE_S - _EPS_S <= face.time_s - end_s <= FRAME_S + _EPS_S else end_s
+        time_s = face.time_s if -FACE_S - _EPS <= face.time_s - end_s <= FRAME_S + _EPS else end_s
         return FaceFrame(time_s, pose, np.clip(shapes, 0.0, 1.0), jaw)
 
     def _finite(self, index: int, what: str, given: ArrayLike | None, shape: tuple[int, ...]) -> Floats | None:

@@ -9,6 +9,7 @@ from hypothesis.extra import numpy as hnp
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_SAMPLES, FaceFrame, Sighting, SpeakerFrame
 from sfms_robot.ports import Source
+from sfms_robot.sources import paired
 from sfms_robot.sources.live_voice import SourcePart
 from sfms_robot.sources.paired import ALLOWANCE_S, FACE_S, LONGEST_WAIT_S, FrameJudge, JudgedSource, PairedSource
 
@@ -39,8 +40,7 @@ def test_only_whole_finite_frames_on_the_grid_get_through(given_frames):
         (frame,) = source.read(0.0)
         assert frame.time_s == (index + 1) / 25
         for audio in (frame.audio, *(() if frame.agent_audio is None else (frame.agent_audio,))):
-            assert audio.dtype == np.float32 and audio.shape in ((0,), (FRAME_SAMPLES,))
-            assert (np.abs(audio) <= 1).all()
+            assert audio.dtype == np.float32 and audio.shape in ((0,), (FRAME_SAMPLES,)) and (np.abs(audio) <= 1).all()
         if frame.face is not None:
             assert np.isfinite(frame.face.motion).all() and frame.face.motion.shape == (58,)
             assert ((frame.face.blendshapes >= 0) & (frame.face.blendshapes <= 1)).all()
@@ -68,6 +68,16 @@ def test_what_is_left_out_is_said_once_and_counted(frame, part, told, caplog):
     assert f"frame 0: {part} left out: {told}" in caplog.text
 
 
+@pytest.mark.parametrize(("pause", "lines"), [([], 1), ([0.1], 0)])
+def test_a_face_that_smiles_for_a_minute_without_a_pause_is_named_once(pause, lines, caplog):
+    levels = [0.6] * (paired.SMILED_FRAMES - 1) + pause + [0.6] * 100
+    shown = [FaceFrame(0.0, np.zeros(6, np.float32), np.full(52, level, np.float32)) for level in levels]
+    source = JudgedSource(Own(*(SpeakerFrame(0.0, SILENCE, face) for face in shown)))
+    given_frames = [source.read(0.0)[0].face.blendshapes[0] for _ in levels]
+    assert np.allclose(given_frames, levels) and len(caplog.records) == lines
+    assert caplog.text.count("smiled for 60 s without a pause") == lines
+
+
 def test_good_frames_go_through_as_they_are():
     audio = np.linspace(-1, 1, FRAME_SAMPLES, dtype=np.float32)
     face = FaceFrame(0.04, np.ones(6, dtype=np.float32), np.full(52, 0.5, dtype=np.float32))
@@ -81,16 +91,10 @@ def test_good_frames_go_through_as_they_are():
 
 
 def test_an_object_that_is_no_source_is_told_what_it_lacks():
-    class Hum:
-        duration_s = None
-
-        def read(self, now_s):
-            return []
-
-    with pytest.raises(
-        ConfigError, match="Hum lacks latency_s, missing, start, moves, statistics, close: derive it from sfms_robot"
-    ):
-        JudgedSource(Hum())
+    hum = type("Hum", (), {"duration_s": None, "read": lambda self, now_s: []})()
+    told = "Hum lacks latency_s, missing, start, moves, statistics, close: derive it from sfms_robot"
+    with pytest.raises(ConfigError, match=told):
+        JudgedSource(hum)
 
 
 # --- the grid ---
@@ -164,14 +168,11 @@ def test_steady_jitter_costs_no_frame(late_s):
 def test_the_face_is_the_newest_at_the_end_of_its_frame_and_none_when_it_is_old(seen_s):
     source, frames, _ = played(None, Scripted(seen_s=seen_s))
     for frame in frames:
-        before = [each for each in seen_s if each <= frame.time_s]
-        fresh = bool(before) and frame.time_s - max(before) <= FACE_S + 1e-6
-        assert (frame.face is not None) == fresh
+        newest_s = max((each for each in seen_s if each <= frame.time_s), default=-1.0)
+        assert (frame.face is not None) == (frame.time_s - newest_s <= FACE_S + 1e-6)
         if frame.face is not None:
-            assert frame.face.pose[0] == np.float32(max(before) / 100) and frame.face.time_s == pytest.approx(
-                max(before), abs=1e-5
-            )
-            assert frame.attention == 0.5
+            assert frame.face.pose[0] == np.float32(newest_s / 100) and frame.attention == 0.5
+            assert frame.face.time_s == pytest.approx(newest_s, abs=1e-5)
     assert source.statistics()["faces_lost"] == sum(frame.face is None for frame in frames)
 
 
@@ -187,13 +188,10 @@ def test_all_parts_start_and_close_together_and_their_age_and_latency_are_measur
 
 
 def test_a_face_tells_attention_where_the_source_does_not() -> None:
-    judge, silence = FrameJudge(), np.zeros(0, np.float32)
     seen = FaceFrame.of(0.0, np.full(58, 0.01))
-    place_m = np.array([1.0, 0.0, 0.0], np.float32)
-    blind = judge.frame(0, silence, None, None)
-    told = judge.frame(1, silence, Sighting(seen), None)
-    given = judge.frame(2, silence, Sighting(seen, 0.25, place_m), None)
-    nowhere = judge.frame(3, silence, Sighting(seen, 0.25, np.full(3, np.nan, np.float32)), None)
+    place_m, no_place = np.array([[1.0, 0.0, 0.0], [np.nan] * 3], np.float32)
+    sights = (None, Sighting(seen), Sighting(seen, 0.25, place_m), Sighting(seen, 0.25, no_place))
+    blind, told, given, nowhere = (FrameJudge().frame(0, SILENCE, sight, None) for sight in sights)
     assert blind.attention is None and blind.place_m is None
     assert told.attention is not None and told.attention > 0.9 and told.place_m is None
     assert given.attention == nowhere.attention == 0.25 and nowhere.place_m is None

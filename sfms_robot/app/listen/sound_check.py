@@ -109,15 +109,11 @@ def level_meter() -> Iterator[Callable[[float, bool], None]]:
     def show(level_db: float, clips: bool) -> None:
         nonlocal clipped
         clipped |= clips
-        if live.is_started:
-            live.update(meter_line(level_db, clipped), refresh=True)
+        if live.is_started:  # a bar from -60 to 0 dB of full scale, and a note after clipping
+            colour = "red" if clipped else "yellow" if level_db > _LOUD_DB else "green"
+            bar = (level_bar(level_db, _WIDTH, "█ "), colour)
+            note = (" clips" if clipped else "", "bold red")
+            live.update(Text.assemble(bar, f" {level_db:6.1f} dBFS", note), refresh=True)
 
     with live if console.is_terminal else nullcontext():
         yield show
-
-
-def meter_line(level_db: float, clipped: bool) -> Text:
-    """Return a bar from -60 to 0 dB of full scale, and a note after clipping."""
-    colour = "red" if clipped else "yellow" if level_db > _LOUD_DB else "green"
-    bar = level_bar(level_db, _WIDTH, "█ ")
-    return Text.assemble((bar, colour), f" {level_db:6.1f} dBFS", (" clips" if clipped else "", "bold red"))

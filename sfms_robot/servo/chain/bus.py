@@ -92,7 +92,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._faults: dict[str, None] = {}  # reported so far, for the statistics
         self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
         self._startups = [
-            self.startup(servo, needs, self._warnings, self._coming_back)
+            self.startup(servo, needs, self._warnings, lambda: [m.startup for m in self._members if m.comes_back])
             for servo, needs in zip(servos, needs_of(servos, conversion, faults), strict=True)
         ]
         self._notices = Notices(name, len(servos))
@@ -157,9 +157,6 @@ class ChainBus(WireBus[RegisterLink]):
         self._settings.clear()
         self._powered, self._released = frozenset(), False
         self._enabled, self._link = False, link
-
-    def _coming_back(self) -> list[Startup]:
-        return [member.startup for member in self._members if member.comes_back]
 
     def enable(self, joints: Sequence[str]) -> Doubles:
         """Switch torque on for `joints` without a jump, one after the other; return the angles held, rad.
