@@ -283,6 +283,7 @@ def people(
         None,
         help="Composed dyads, or any data set with voices; default: bundled voices that no listener was trained on.",
     ),
+    split: Unseen = SPLIT,
     voices: int = Option(8, min=1, help="Voices that each listens to."),
     seconds: float = Option(12.0, min=2.0, max=60.0, help="Length of a clip."),
     seed: int = SEED,
@@ -299,11 +300,10 @@ def people(
     if results is not None:
         show(people_study.summary(people_study.read_answers(results)), json, heading=_ANSWERS)
         return
-    study = people_study.prepare(listener, data, voices=voices, seconds=seconds, seed=seed, folder=out)
+    study = people_study.prepare(listener, data, split, voices=voices, seconds=seconds, seed=seed, folder=out)
 
     def ask(url: str, taken: int | None) -> None:
-        note = "" if taken is None else f" (port {taken} is taken)"
-        aside(f"people answer at {url}{note}; Ctrl-C ends")
+        aside(f"people answer at {url}{f' (port {taken} is taken)' if taken else ''}; Ctrl-C ends")
 
     try:
         people_study.serve(study, view, ask)

@@ -34,6 +34,7 @@ from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Doubles, Floats, SpeakerFrame
 from sfms_robot.lab import Figures
+from sfms_robot.lab.corpora.clips import Split
 from sfms_robot.lab.evaluation.intervals import LEVEL, draw_people, ends
 from sfms_robot.lab.evaluation.robustness import unseen, voice_folders
 from sfms_robot.lab.evaluation.rollout import frames_of_dyad, rollout, speaker_frames, spread, streamable
@@ -50,9 +51,8 @@ QUESTIONS: Final = {
 NEITHER: Final = "neither"
 RECORDED: Final = "recorded"
 _STUDY, _ANSWERS, _CLIPS = "study.json", "answers.csv", "clips"
-_WARM_UP_S: Final = 10.0  # heard before a clip begins: a listener remembers
+_WARM_UP: Final = 10 * FRAME_HZ  # frames heard before a clip begins: a listener remembers
 _HOPS: Final = 997  # between the seeds of voices
-_HALF: Final = 0.5  # of a win in each direction of every pair: strengths stay finite if one always wins
 _STEPS: Final = 200
 
 
@@ -91,7 +91,8 @@ class Study:
         described = json.loads((folder / _STUDY).read_text(encoding="utf-8"))
         self.conditions: list[str] = described["conditions"]
         self._voices, self._seed = len(described["voices"]), int(described["seed"])
-        self._answers = read_answers(folder / _ANSWERS) if (folder / _ANSWERS).is_file() else []
+        self._file = folder / _ANSWERS
+        self._answers = read_answers(self._file) if self._file.is_file() else []
 
     @property
     def questions(self) -> Mapping[str, str]:
@@ -114,8 +115,8 @@ class Study:
         if left:
             trial = left[0]
             found |= {"trial": trial.trial, "audio": f"voice-{trial.voice}.wav"}
-            for side, condition in (("left", trial.left), ("right", trial.right)):
-                found[side] = f"{clip_name(self._seed, condition, trial.voice)}.f32"
+            for side in ("left", "right"):
+                found[side] = f"{clip_name(self._seed, getattr(trial, side), trial.voice)}.f32"
         return found
 
     def answer(self, participant: str, number: int, chosen: Mapping[str, str]) -> None:
@@ -136,16 +137,14 @@ class Study:
             Preference(participant=participant, question=question, chosen=sides[chosen[question]], **asdict(trial))
             for question in QUESTIONS
         ]
-        file = self.folder / _ANSWERS
         try:
-            new = not file.is_file()
-            with file.open("a", encoding="utf-8", newline="") as lines:
+            with self._file.open("a", encoding="utf-8", newline="") as lines:
                 table = csv.DictWriter(lines, _COLUMNS)
-                if new:
+                if not lines.tell():
                     table.writeheader()
                 table.writerows(map(asdict, rows))
         except OSError as error:
-            raise ConfigError(f"{file}: cannot be written: {error.strerror}") from error
+            raise ConfigError(f"{self._file}: cannot be written: {error.strerror}") from error
         self._answers += rows
 
     def results(self) -> Figures:
@@ -187,13 +186,14 @@ class _StudyVoice:
 
 
 def prepare(
-    conditions: Sequence[str], data: Path | None, *, voices: int, seconds: float, seed: int, folder: Path
+    conditions: Sequence[str], data: Path | None, split: Split, *, voices: int, seconds: float, seed: int, folder: Path
 ) -> Study:
     """Return the study in `folder`, made if it is missing. Blocks for minutes.
 
     Args:
         conditions: Listeners by name or folder, and RECORDED for the people of `data`.
-        data: Composed dyads, or any data set with voices; None: the bundled voices that were never trained on.
+        data: Composed dyads, or any data set with voices; None: bundled voices.
+        split: Part of them.
         voices: How many; each condition hears every voice.
         seconds: Length of a clip.
         seed: Of the listeners and of the order of trials.
@@ -205,33 +205,33 @@ def prepare(
         "version": 1,
         "conditions": list(conditions),
         "weights": _weights(conditions, data),
-        "data": None if data is None else data.name,
+        "data": data and data.name,
+        "split": split,
         "seconds": seconds,
         "asked_voices": voices,
         "seed": seed,
     }
     file, clips = folder / _STUDY, folder / _CLIPS
     if file.is_file():
-        found = json.loads(file.read_text(encoding="utf-8"))
+        found = {"split": "test", **json.loads(file.read_text(encoding="utf-8"))}
         if found != described | {"voices": found.get("voices")}:
             raise ConfigError(f"{file}: another study (other conditions, voices or seed); name another folder (--out)")
         return Study(folder)
-    heard = _voices(data, voices, round(seconds * FRAME_HZ))
+    heard = _voices(data, split, voices, round(seconds * FRAME_HZ))
     clips.mkdir(parents=True, exist_ok=True)
     one_thread()
     for condition in tracked(conditions, "clips"):
         listener = None if condition == RECORDED else load_listener(condition)
         for number, each in enumerate(heard):
-            motion = each.recorded
+            motion, length = each.recorded, len(each.audio) // FRAME_SAMPLES
             if listener is not None:
-                played = rollout(listener, each.frames, [seed + _HOPS * number])
-                motion = played.motion[0, -(len(each.audio) // FRAME_SAMPLES) :]
+                motion = rollout(listener, each.frames, [seed + _HOPS * number]).motion[0, -length:]
             assert motion is not None  # `_weights` asks for data
             motion.astype("<f4").tofile(clips / f"{clip_name(seed, condition, number)}.f32")
     for number, each in enumerate(heard):
         soundfile.write(clips / f"voice-{number}.wav", each.audio, AUDIO_HZ, subtype="PCM_16")
-    plain = described | {"voices": [each.name for each in heard]}
-    file.write_text(json.dumps(plain, indent=1) + "\n", encoding="utf-8")
+    described["voices"] = [each.name for each in heard]
+    file.write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
     return Study(folder)
 
 
@@ -255,9 +255,8 @@ def _weights(conditions: Sequence[str], data: Path | None) -> dict[str, str]:
     return weights
 
 
-def _voices(data: Path | None, count: int, length: int) -> list[_StudyVoice]:
+def _voices(data: Path | None, split: Split, count: int, length: int) -> list[_StudyVoice]:
     """Return voices of `length` frames, each after a warm-up. Raises ConfigError if there are too few."""
-    warm_up = round(_WARM_UP_S * FRAME_HZ)
     found: list[_StudyVoice] = []
 
     def cut(name: str, frames: Sequence[SpeakerFrame], audio: Floats, recorded: Floats | None, end: int) -> None:
@@ -265,15 +264,15 @@ def _voices(data: Path | None, count: int, length: int) -> list[_StudyVoice]:
         begin = end - length
         sound = audio[begin * FRAME_SAMPLES : end * FRAME_SAMPLES]
         motion = None if recorded is None else recorded[begin:end]
-        found.append(_StudyVoice(name, frames[max(0, begin - warm_up) : end], sound, motion))
+        found.append(_StudyVoice(name, frames[max(0, begin - _WARM_UP) : end], sound, motion))
 
     if data is not None:
-        for dyad in streamable(data, "test"):
+        for dyad in streamable(data, split):
             if dyad.audio is not None and len(dyad.speaker) >= length:
-                end = min(len(dyad.speaker), length + warm_up)
+                end = min(len(dyad.speaker), length + _WARM_UP)
                 cut(dyad.name, frames_of_dyad(dyad), dyad.audio, dyad.listener, end)
-    else:  # consecutive pieces of the bundled voices that were never trained on
-        for speaker in unseen(voice_folders(None)):
+    else:  # consecutive pieces of the bundled voices
+        for speaker in unseen(voice_folders(None), split):
             frames = speaker_frames(speaker.voice, speaker.face, attention=np.ones(len(speaker.face), np.float32))
             for end in range(length, len(frames) + 1, length):
                 cut(f"{speaker.name} {(end - length) / FRAME_HZ:.0f} s", frames, speaker.voice, None, end)
@@ -339,8 +338,8 @@ def _pair(question: str, first: str, second: str, asked: Sequence[Preference]) -
     }  # fmt: skip
     if sum(wins):
         test = binomtest(wins[0], sum(wins), 0.5)
-        low, high = test.proportion_ci(LEVEL, method="exact")
-        row |= {"share": wins[0] / sum(wins), "interval": [float(low), float(high)], "p": float(test.pvalue)}
+        interval = [*map(float, test.proportion_ci(LEVEL, method="exact"))]
+        row |= {"share": wins[0] / sum(wins), "interval": interval, "p": float(test.pvalue)}
     return row
 
 
@@ -364,7 +363,7 @@ def _strengths(conditions: Sequence[str], asked: Sequence[Preference]) -> dict[s
 
 def bradley_terry(wins: Doubles) -> Doubles:
     """Return log strengths (K,) with mean 0 of wins (K, K), row before column, by Hunter's minorization (2004)."""
-    padded = wins + _HALF * (1 - np.eye(len(wins)))
+    padded = wins + 0.5 * (1 - np.eye(len(wins)))  # half a win each way: strengths stay finite if one always wins
     met, won = padded + padded.T, padded.sum(axis=1)
     strength = np.ones(len(wins))
     for _ in range(_STEPS):

@@ -32,11 +32,9 @@ def study(folder):
     return Study(folder)
 
 
-def options_for(tmp_path, conditions, data=None, voices=1, seed=1):
-    folder = tmp_path / "study"
-    return {
-        "conditions": conditions, "data": data, "voices": voices, "seconds": 2.0, "seed": seed, "folder": folder
-    }  # fmt: skip
+def options_for(tmp_path, conditions, data=None, voices=1, seed=1, split="test"):
+    same = {"seconds": 2.0, "folder": tmp_path / "study"}
+    return {"conditions": conditions, "data": data, "voices": voices, "seed": seed, "split": split, **same}
 
 
 def test_answers_are_kept_a_person_goes_on_and_each_counts_once(tmp_path):
@@ -63,11 +61,12 @@ def test_the_page_is_not_told_which_is_which(tmp_path):
     assert names == {shown[side].removesuffix(".f32") for side in ("left", "right")}
 
 
-def test_recorded_motion_is_a_clip_like_that_of_a_listener(tmp_path):
+@pytest.mark.parametrize("split", ["validation", "test"])
+def test_recorded_motion_is_a_clip_like_that_of_a_listener(tmp_path, split):
     draw, frames = np.random.default_rng(0), 60
     speaker, listener = draw.uniform(0, 0.4, (2, frames, 58)).astype(np.float32)
-    clips.save(tmp_path / "data" / "test", [made_dyad(listener, speaker=speaker)])
-    options = options_for(tmp_path, ["sfms-small", "recorded"], tmp_path / "data", seed=5)
+    clips.save(tmp_path / "data" / split, [made_dyad(listener, speaker=speaker)])
+    options = options_for(tmp_path, ["sfms-small", "recorded"], tmp_path / "data", seed=5, split=split)
     made = prepare(**options)
     shown = {
         name: np.fromfile(made.clips / f"{clip_name(5, name, 0)}.f32", "<f4").reshape(-1, 58)
@@ -78,6 +77,8 @@ def test_recorded_motion_is_a_clip_like_that_of_a_listener(tmp_path):
     voice, rate_hz = soundfile.read(made.clips / "voice-0.wav")
     assert (len(voice), rate_hz) == (32_000, 16_000)
     assert prepare(**options).conditions == ["sfms-small", "recorded"]  # it goes on
+    with pytest.raises(ConfigError, match="another study"):
+        prepare(**options | {"split": "train"})
 
 
 @pytest.mark.parametrize(
@@ -136,8 +137,6 @@ def test_clips_are_made_once(tmp_path):
     files = {file.name: file.stat().st_mtime_ns for file in made.clips.iterdir()}
     prepare(**options)
     assert files == {file.name: file.stat().st_mtime_ns for file in made.clips.iterdir()}
-    with pytest.raises(ConfigError, match="another study"):
-        prepare(**options_for(tmp_path, ("sfms-small", "arig-small"), voices=2, seed=2))
 
 
 def answers(counts, question="person", left="a", right="b"):
