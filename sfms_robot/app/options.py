@@ -190,11 +190,12 @@ def begin_listening(options: RunOptions) -> PlanFeed:
 
     One on another machine chooses its engine itself. Raises ConfigError, MissingExtra.
     """
-    from sfms_robot.listeners.process import ListenerProcess
+    if not options.listener.startswith(REMOTE):
+        from sfms_robot.listeners.process import ListenerProcess
+
+        return ListenerProcess(options.listener, options.seed, options.calmness, options.engine)
     from sfms_robot.listeners.remote import RemoteListener, ZenohLink
 
-    if not options.listener.startswith(REMOTE):
-        return ListenerProcess(options.listener, options.seed, options.calmness, options.engine)
     served = check_name(options.listener.removeprefix(REMOTE), "listener")
     return RemoteListener(served, ZenohLink(served, options.router), options.seed, options.calmness)
 

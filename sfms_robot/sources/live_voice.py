@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import logging
 import math
-import statistics
 import threading
 import time
 from collections import deque
@@ -219,7 +218,7 @@ class Pace:
         self._least.append((now_s, self._behind_s))
         if len(self._least) == self._least.maxlen:
             whole = list(self._least)[:-1]
-            self.rate = 1.0 - statistics.median((d - b) / (c - a) for (a, b), (c, d) in pairwise(whole))
+            self.rate = 1.0 - float(np.median([(d - b) / (c - a) for (a, b), (c, d) in pairwise(whole)]))
 
     @property
     def problem(self) -> str | None:

@@ -7,6 +7,7 @@ with its voice.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +15,9 @@ from sfms_robot.frames import FRAME_HZ, FRAME_S, FRAME_SAMPLES, SILENCE, FaceFra
 from sfms_robot.signals.audio import AudioFile
 from sfms_robot.signals.tracks import Track, resample
 from sfms_robot.sources.live_voice import SourcePart, window
-from sfms_robot.sources.push import Player
+
+if TYPE_CHECKING:
+    from sfms_robot.sources.push import Player
 
 _PAUSE_FRAMES = FRAME_HZ  # silence before a recording starts again
 _EPS_FRAMES = 1e-6
