@@ -22,7 +22,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from itertools import pairwise
 from numbers import Real
 from typing import Any, Final
 
@@ -217,8 +216,8 @@ class Pace:
             return
         self._least.append((now_s, self._behind_s))
         if len(self._least) == self._least.maxlen:
-            whole = list(self._least)[:-1]
-            self.rate = 1.0 - float(np.median([(d - b) / (c - a) for (a, b), (c, d) in pairwise(whole)]))
+            time_s, behind_s = np.diff(list(self._least)[:-1], axis=0).T
+            self.rate = 1.0 - float(np.median(behind_s / time_s))
 
     @property
     def problem(self) -> str | None:
