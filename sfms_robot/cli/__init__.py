@@ -1,5 +1,6 @@
 """The command line. This file comes first and imports next to nothing, so that Ctrl-C is quiet from the start."""
 
+import gc
 import os
 import signal
 import sys
@@ -8,8 +9,11 @@ import sys
 def start() -> None:
     """Run `sfms-robot`. Ctrl-C while its modules are imported ends the process with exit code 130, without a word."""
     before = signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+    gc.disable()  # all that is imported stays: to look through it for garbage would only delay the command
     from sfms_robot.cli.main import main
 
+    gc.freeze()
+    gc.enable()
     try:
         signal.signal(signal.SIGINT, before)
         main()
