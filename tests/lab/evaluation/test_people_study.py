@@ -63,8 +63,7 @@ def test_the_page_is_not_told_which_is_which(tmp_path):
 
 @pytest.mark.parametrize("split", ["validation", "test"])
 def test_recorded_motion_is_a_clip_like_that_of_a_listener(tmp_path, split):
-    draw, frames = np.random.default_rng(0), 60
-    speaker, listener = draw.uniform(0, 0.4, (2, frames, 58)).astype(np.float32)
+    speaker, listener = np.random.default_rng(0).uniform(0, 0.4, (2, 60, 58)).astype(np.float32)
     clips.save(tmp_path / "data" / split, [made_dyad(listener, speaker=speaker)])
     options = options_for(tmp_path, ["sfms-small", "recorded"], tmp_path / "data", seed=5, split=split)
     made = prepare(**options)
@@ -77,8 +76,9 @@ def test_recorded_motion_is_a_clip_like_that_of_a_listener(tmp_path, split):
     voice, rate_hz = soundfile.read(made.clips / "voice-0.wav")
     assert (len(voice), rate_hz) == (32_000, 16_000)
     assert prepare(**options).conditions == ["sfms-small", "recorded"]  # it goes on
-    with pytest.raises(ConfigError, match="another study"):
-        prepare(**options | {"split": "train"})
+    for other in ({"split": "train"}, {"seed": 2}):
+        with pytest.raises(ConfigError, match="another study"):
+            prepare(**options | other)
 
 
 @pytest.mark.parametrize(
