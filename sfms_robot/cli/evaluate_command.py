@@ -88,8 +88,8 @@ def listener_(
         [], metavar="NAME|DIR", help="May be given often. sfms-small; arig-small for the tables of ARIG."
     ),
     data: Path = Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
-    table: Literal["1", "2", "arig-1", "arig-2", "arig-4"] | None = Option(
-        None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, and ablations 1 and 4."
+    table: Literal["1", "2", "arig-1", "arig-2", "arig-4", "arig-readings"] | None = Option(
+        None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, ablations 1 and 4, readings."
     ),
     samples: int = Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
     clips: int | None = Option(None, min=1, help="At most this many dyads, for --table; all of them."),
@@ -98,7 +98,9 @@ def listener_(
     ),
     config: Path | None = Option(None, help="Training of the ablations; configs/training/arig-as-written.yaml."),
     steps: int | None = Option(None, min=1, help="Another number of training steps than the file's."),
-    seeds: int = Option(1, min=1, help="Trainings of each row of arig-1 and arig-4; three and more say what holds."),
+    seeds: int = Option(
+        1, min=1, help="Trainings of each row of ARIG's tables, except arig-2; three and more say what holds."
+    ),
     split: Unseen = SPLIT,
     seed: int = SEED,
     hop: int | None = HOP,
@@ -134,12 +136,12 @@ def papers(
         None, help="Folder of what only tables need; what is missing is trained: hours. Without it: said to be missing."
     ),
     table: list[str] = Option(
-        [], metavar="1|2|3|4|arig-1|arig-2|arig-4", help="May be given often; all of them if not."
+        [], metavar="1|2|3|4|arig-1|arig-2|arig-4|arig-readings", help="May be given often; all of them if not."
     ),
     clips: int | None = Option(None, min=1, help="At most this many dyads a table; all of them."),
     samples: int = Option(10, min=1, help="Answers to every clip of tables 1 and 2."),
     steps: int | None = Option(None, min=1, help="Another number of steps than the training files'."),
-    seeds: int = Option(1, min=1, help="Trainings of each row of arig-1 and arig-4."),
+    seeds: int = Option(1, min=1, help="Trainings of each row of ARIG's tables, except arig-2."),
     split: Unseen = SPLIT,
     seed: int = SEED,
     json: bool = JSON,
@@ -255,8 +257,11 @@ def metrics_(
     """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
     from sfms_robot.lab.evaluation.motion_metrics import evaluate_metrics
 
-    found = evaluate_metrics(truth, prediction, speaker, space=space, frames=frames, seed=seed)
-    show(found, json, note="interval: 95 % over clips")
+    show(
+        evaluate_metrics(truth, prediction, speaker, space=space, frames=frames, seed=seed),
+        json,
+        note="interval: 95 % over clips",
+    )
 
 
 @app.command()

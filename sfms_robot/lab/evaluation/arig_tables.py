@@ -43,7 +43,7 @@ from sfms_robot.listeners.sfms.stream import SfmsListener
 
 Kind = Literal["sfms", "arig"]
 LABELS: Final = {"sfms": "SFMS, as written", "arig": "ARIG, as written"}
-ARIG_TABLES: Final = ("arig-1", "arig-2", "arig-4")
+ARIG_TABLES: Final = ("arig-1", "arig-2", "arig-4", "arig-readings")
 CLIP_FRAMES: Final = 250
 PARTS: Final = {"exp": SHAPES, "pose": POSE}
 _CLUSTERS: Final = {"exp": 40, "pose": 20}  # DIM's; the paper names none
@@ -64,7 +64,7 @@ class TableOptions:
         samples: Answers to every clip of tables 1 and 2 of SFMS.
         steps: Of every training, in place of its file's.
         seed: Of the listeners.
-        seeds: Trainings of each row of `arig-1` and `arig-4`.
+        seeds: Trainings of each row of ARIG's tables, except `arig-2`.
         split: Part of the dyads; of tables 3 and 4 the held-out recordings.
         training: Training file of ARIG's ablations; None: the paper as written.
         order, hop: Of tables 1 and 2 of SFMS; see `load_at_hop`.
@@ -108,7 +108,7 @@ def rows_of(
 ) -> tuple[list[Figures], list[Figures]]:
     """Return the rows of a table (truth, ours by name, the paper's), and what holds of the paper's statements.
 
-    Rows of `arig-1` and `arig-4` have the paper's RPCC, SID and Var beside ours. Answers hold the clips of one training
+    Rows of all but `arig-2` have the paper's RPCC, SID and Var beside ours. Answers hold the clips of one training
     after another. `people`: the listener of each clip of the truth, for intervals over them and over trainings.
     """
 
@@ -175,7 +175,10 @@ def claims(
 
 
 def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bool = True) -> Figures:
-    """Return `arig-2`: `names` side by side on the listening set; or `arig-1`, `arig-4`: ablations, on interaction.
+    """Return one of ARIG's tables: `names` side by side, and for all but `arig-2` rows that are trained for it.
+
+    `arig-2` is of the listening set; of the interaction set are `arig-1` and `arig-4`, ablations, and `arig-readings`,
+    readings of what the paper leaves open.
 
     Args:
         name: Of `ARIG_TABLES`.
@@ -198,7 +201,7 @@ def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bo
         if models is None:
             raise ConfigError(f"--table {name}: needs --models DIR, where its listeners are trained and kept")
         unchanged = "arig-as-written" if options.training is None else "arig"
-        rows = {"ARIG": {}, **PRINTED[name].get("readings", {}), **PRINTED[name]["ablations"]}
+        rows = {"ARIG": {}, **PRINTED[name]["ablations"]}
         folders = {
             label: [
                 trained(

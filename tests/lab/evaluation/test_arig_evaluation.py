@@ -64,7 +64,7 @@ def test_table_2_has_a_row_for_every_listener_given_and_the_papers(command_line,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("table", "paper"), [(name, PRINTED[name]) for name in ("arig-1", "arig-4")])
+@pytest.mark.parametrize(("table", "paper"), [(name, PRINTED[name]) for name in ("arig-1", "arig-4", "arig-readings")])
 def test_ablations_that_are_missing_are_trained_and_kept(command_line, listener, lively, tmp_path, table, paper):
     file = tmp_path / "arig.yaml"
     file.write_text(yaml.safe_dump(settings(steps=2).model_dump(mode="json")))
@@ -72,7 +72,7 @@ def test_ablations_that_are_missing_are_trained_and_kept(command_line, listener,
     words += ("--models", tmp_path / "m", "--config", file, "--json")
     ended = command_line(*words)
     assert ended.code == 0 and {row["name"] for row in ended.told["rows"]} == {
-        "GT", *paper["rows"], str(listener), *paper.get("readings", ()),
+        "GT", "ARIG", *paper["ablations"], *paper["rows"], str(listener),
     }  # fmt: skip
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "m").rglob("*.safetensors")}
     assert command_line(*words).out == ended.out and before == {path: path.stat().st_mtime_ns for path in before}
@@ -114,7 +114,7 @@ def test_a_table_has_the_paper_as_written_beside_ours(command_line, lively, tmp_
 
 def test_a_table_that_neither_paper_has_is_named(command_line, tmp_path) -> None:
     ended = command_line("evaluate", "papers", "--data", tmp_path, "--models", tmp_path / "m", "--table", "5")
-    assert ended.code == 2 and "--table 5: is not one of 1, 2, 3, 4, arig-1, arig-2, arig-4" in ended.err
+    assert ended.code == 2 and "--table 5: is not one of 1, 2, 3, 4, arig-1, arig-2, arig-4, arig-readings" in ended.err
     assert not (tmp_path / "m").exists()
 
 
