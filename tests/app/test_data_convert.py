@@ -26,7 +26,6 @@ def matrix(folder):
     return rows
 
 
-# --- laws -------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("name", ["l2l", "lm_listener", "react2025", "dualtalk", "dualtalk_arkit", "dim", "seamless"])
 def test_every_convertible_set_becomes_one_that_listeners_are_trained_on(name, tmp_path):
     source = getattr(write, name)(tmp_path / "in")
@@ -123,7 +122,13 @@ def test_licence_goes_along(tmp_path, caplog, command_line):
     assert "source.yaml: licence = [1] is not text" in report["splits"][0]["problems"][0]["first"]
 
 
-# --- bad input --------------------------------------------------------------------------------------------------
+def test_an_order_that_is_given_is_taken_although_the_files_look_like_the_other(tmp_path, command_line):
+    write.l2l(tmp_path / "in", pose_first=True)
+    words = ("data", "convert", tmp_path / "in", tmp_path / "out")
+    assert "say --order pose-first (or --order exp-first if you know better)" in command_line(*words).complaint
+    assert command_line(*words, "--order", "exp-first").code == 0
+
+
 @pytest.mark.parametrize(
     ("writer", "words", "said"),
     [

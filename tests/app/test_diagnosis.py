@@ -73,6 +73,8 @@ def test_permissions_holders_latency_and_a_udev_rule_come_with_what_to_type():
     timer, name = diagnosis.udev_rule(ftdi).splitlines()
     assert 'DRIVER=="ftdi_sio"' in timer and 'ATTR{latency_timer}="1"' in timer
     assert 'ATTRS{serial}=="FT4TFS1T"' in name and 'SYMLINK+="servos-FT4TFS1T"' in name
+    ch340 = SerialDevice("/dev/ttyUSB1", vendor="1a86", product="7523")
+    assert diagnosis.udev_rule(ch340).endswith('SYMLINK+="servos-$env{ID_PATH_TAG}"')  # two of a kind: by their socket
     assert diagnosis.udev_rule(SerialDevice("/dev/ttyS0")) is None
 
 

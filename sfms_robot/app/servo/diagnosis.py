@@ -180,15 +180,15 @@ def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[F
 def udev_rule(device: SerialDevice) -> str | None:
     """Return lines of a udev rule that last: the latency timer, and a name for this adapter.
 
-    None for a port that is not a USB adapter. An adapter without a serial number is known by the socket it is plugged
-    into, since two of a kind would share a name.
+    None for a port that is not a USB adapter. An adapter without a serial number is named by its USB socket, since two
+    of a kind would share a name; `ID_PATH_TAG` is set by 60-serial.rules of systemd, which come before 99.
     """
     if device.vendor is None or device.product is None:
         return None
     which = f'ATTRS{{idVendor}}=="{device.vendor}", ATTRS{{idProduct}}=="{device.product}"'
     if device.serial:
         which += f', ATTRS{{serial}}=="{device.serial}"'
-    lines = [f'SUBSYSTEM=="tty", {which}, SYMLINK+="servos-{device.serial or "%k"}"']
+    lines = [f'SUBSYSTEM=="tty", {which}, SYMLINK+="servos-{device.serial or "$env{ID_PATH_TAG}"}"']
     if device.latency_file is not None:
         timer = f'ATTR{{latency_timer}}="{FAST_ENOUGH_MS}"'
         lines.insert(0, f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="{device.driver}", {timer}')

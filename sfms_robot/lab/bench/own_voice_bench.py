@@ -45,7 +45,7 @@ _TITLES: Final = {
     "own_voice_taken": "own voice taken for the person",
     "person_missed": "person missed",
     "person_missed_in_double_talk": "missed in double talk",
-    "nobody_taken": "nobody taken for the person",
+    "nobody_taken": "silence taken for the person",
     "core_share": "of a core",
 }
 
@@ -67,7 +67,7 @@ class VoiceCondition:
         over = ", talks over" if self.talks_over else ""
         own = "silent" if self.own_db is None else f"{self.own_db:+.0f} dB{over}"
         motors = "still" if self.motors_db is None else f"{self.motors_db:+.0f} dB"
-        return f"{self.room} | own voice {own} | motors {motors}{'' if self.person else ', nobody there'}"
+        return f"{self.room} | own voice {own} | motors {motors}{'' if self.person else ', no person there'}"
 
 
 CONDITIONS: Final = (

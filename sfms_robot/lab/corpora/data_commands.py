@@ -211,12 +211,15 @@ def convert_data(
         raise ConfigError(f"{out}: is not empty: dyads of two conversions would be mixed")
     residual = Residual()
     sets = [formats.scan_split(found, place, name, order) for name in formats.split_names(found, place)]
+    for one in sets:
+        if order is None and (said := formats.wrong_order(one, found.order)):
+            raise ConfigError(f"{one.split}: {said}")
     licence = next((one.licence for one in sets if one.licence), None)
     out.mkdir(parents=True, exist_ok=True)
     origin = {"layout": found.name, "folder": str(place.resolve()), "licence": licence}
     text = "# Written by `sfms-robot data convert`: whose data these dyads are.\n" + yaml.safe_dump(origin, width=1000)
     (out / formats.SOURCE).write_text(text, encoding="utf-8")
-    splits = [_converted(dataset, out / dataset.split, residual, flame, order or found.order) for dataset in sets]
+    splits = [_converted(dataset, out / dataset.split, residual, flame) for dataset in sets]
     if not any(split["clips"] for split in splits):
         (out / formats.SOURCE).unlink()
         first = next((one for split in splits for one in split["left_out"]), None)
@@ -233,12 +236,8 @@ def convert_data(
     }
 
 
-def _converted(
-    dataset: Dataset, out: Path, residual: Residual, flame: FlameMatrix | None, order: Order | None
-) -> Figures:
+def _converted(dataset: Dataset, out: Path, residual: Residual, flame: FlameMatrix | None) -> Figures:
     """Convert every clip of a split, write it, and compare the motion that is read back; return the split's report."""
-    if said := formats.wrong_order(dataset, order):
-        raise ConfigError(f"{dataset.split}: {said}")
     problems, seconds, written = list(dataset.problems), 0.0, 0
     for index in tracked(range(len(dataset)), dataset.split):
         try:

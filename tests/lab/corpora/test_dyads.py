@@ -103,7 +103,6 @@ def test_broken_file_is_one_clear_line(tmp_path, content):
         clips.read(tmp_path / "x.npz")
 
 
-# --- sets of them ---------------------------------------------------------------------------------------------
 def lazy(*dyads: Dyad | Exception) -> tuple[Dataset, list[int]]:
     """A set that notes what is read."""
     read: list[int] = []

@@ -40,7 +40,6 @@ def test_the_distance_of_two_histograms():
     assert [found[key].value for key in ("a a", "a b", "a c")] == [0.0, 1.0, pytest.approx(0.5)]
 
 
-# --- metrics that pool all clips --------------------------------------------------------------------------------
 def _mean_of(values):
     return lambda clips: {"mean": float(values[clips].mean()), "unknown": float("nan")}
 

@@ -164,7 +164,6 @@ def test_random_has_the_moments_of_even_numbers_in_the_range_of_training():
     assert 0 <= pose.min() and pose.max() <= 0.1
 
 
-# --- `evaluate --hop N`: the hops that a run may choose, and no other ------------------------------------------------
 @pytest.mark.parametrize(("hop", "plans_every"), [(None, 4), (2, 2), (8, 8)])
 def test_a_listener_plans_as_often_as_it_is_told(hop, plans_every):
     assert load_at_hop("sfms-small", hop).hop == plans_every

@@ -64,7 +64,6 @@ def figures(*meetings):
     return {name: one.value for name, one in estimates(timing.figures_of(rows[0]), rows, seed=1, draws=50).items()}
 
 
-# --- how often --------------------------------------------------------------------------------------------------
 def test_people_judged_against_themselves_are_themselves():
     one = meeting(answering(talk()))
     runs = [one.spans_s["nod"]] * 3
@@ -126,7 +125,6 @@ def test_what_a_finder_misses_is_made_up_for():
     assert plain["blinks_per_minute"].tolist() == [0, pytest.approx(2.0)]
 
 
-# --- ranking ----------------------------------------------------------------------------------------------------
 def test_moving_a_listeners_own_nods_tells_the_same():
     one, everything = meeting(answering(talk())), np.ones(FRAMES, bool)
     runs = [spans(answering(talk(), seed=seed)) for seed in range(1, 9)]
@@ -164,7 +162,6 @@ def test_the_nod_table_ranks_those_it_was_counted_on_and_not_random_people():
     assert random[0] / random[1] == pytest.approx(0.5, abs=0.04)
 
 
-# --- people -----------------------------------------------------------------------------------------------------
 def test_a_persons_auc_is_the_mean_over_his_nods_and_counts_once():
     def sums(auc, nods):
         return {"x_auc": np.array([auc * nods, nods]), "nods_per_minute": np.array([nods, 10.0])}
@@ -201,7 +198,6 @@ def test_meetings_are_spread_evenly_and_played_from_their_middle():
     assert (middle(30_000, 5.0), middle(100, 5.0), middle(100, 0.0)[1]) == ((11_250, 7_500), (0, 100), 0)
 
 
-# --- rolling out ------------------------------------------------------------------------------------------------
 class Metronome:
     """Listens to nobody: after every 4th frame a plan of 8, whose pitch is the seed plus the frames heard so far."""
 
