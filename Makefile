@@ -1,7 +1,7 @@
-# `make run`: an emulated head listens, shown on a page. `make test`: the tests. Both make .venv first if it is missing.
+# `make run`: an emulated head listens and is shown on a page. `make test`: the tests. Both create .venv if it is missing.
 VENV := .venv
 BIN := $(VENV)/bin
-# The first of these that is Python 3.11 to 3.14; `make PYTHON=...` names another.
+# The first of these that is Python 3.11 to 3.14; `make PYTHON=...` sets another.
 FITS := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
 	$$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
@@ -11,11 +11,11 @@ INSTALL = test -d $(VENV) || $(PYTHON) -m venv $(VENV); \
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check
 PIPECAT := .venv-pipecat
 PYTEST := $(BIN)/python -m pytest
-# A file of tests to a process. One process more than there are cores: many tests wait for servos and for children.
+# Each test file runs in one process. There is one process more than cores: many tests wait for servos and child processes.
 WORKERS = $(shell $(PYTHON) -c 'import os; print(os.cpu_count() + 1)')
 PARALLEL = -n $(WORKERS) --dist loadfile
 TESTS := not hardware and not gpu
-REALTIME = $(shell grep -lr --include='test_*.py' mark.realtime tests)  # the other files need not be loaded
+REALTIME = $(shell grep -lr --include='test_*.py' mark.realtime tests)  # no need to load the other files
 
 .PHONY: run test test-all lint bench install clean
 
@@ -24,7 +24,7 @@ run: $(VENV)/.run
 
 install: $(VENV)/.installed
 
-# What a run and its plots need: no torch. `make install` adds the tools of developers to the same environment.
+# Packages for a run and its plots, without torch. `make install` adds the development tools to the same environment.
 $(VENV)/.run: pyproject.toml
 	@$(CHECKED)
 	@echo 'Installing sfms-robot with its plots into $(VENV): about 520 MB, one to two minutes, once.'
@@ -36,7 +36,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(INSTALL) -c constraints.txt -e '.[dev]'
 	@touch $@ $(VENV)/.run
 
-# pipecat pins soxr 1.0, and our tests need 1.1.
+# pipecat pins soxr 1.0, but the tests need 1.1.
 $(PIPECAT)/.installed: pyproject.toml constraints.txt
 	test -d $(PIPECAT) || $(PYTHON) -m venv $(PIPECAT)
 	$(PIPECAT)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[pipecat]' \

@@ -8,7 +8,7 @@ matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 from matplotlib.patches import FancyBboxPatch
 
-# (package, what it does, what leaves it), along the way of one frame of 40 ms
+# (package, task, output), in the order that a frame of 40 ms passes
 CHAIN = [
     ("sources", "the person", "SpeakerFrame:\nsound and face, 40 ms"),
     ("listeners", "SFMS, ARIG, yours", "Plan: our face for\nthe coming frames"),

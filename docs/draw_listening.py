@@ -45,7 +45,7 @@ def panes(folder):
 
 
 def with_voice(recording, time_s, pane):
-    """Return the picture with the speaker's voice below it, and a line at its instant."""
+    """Return the picture with the speaker's voice below, and a line at the current time."""
     wide, high = pane.size
     picture = Image.new("RGB", (wide, high + VOICE_PX), "white")
     picture.paste(pane)

@@ -1,6 +1,6 @@
-"""An assistant joined to a robot: it hears through the robot's ears, and the head moves with what it says.
+"""An assistant connected to a robot: it receives the robot's microphone, and the head moves with its speech.
 
-In one terminal `sfms-robot run --agent-audio tcp`, in another this; docs/reference/protocol.md says what is sent.
+Run `sfms-robot run --agent-audio tcp` in one terminal and this in another. docs/reference/protocol.md has the messages.
 """
 
 import json
@@ -11,13 +11,13 @@ import time
 import numpy as np
 from websockets.sync.client import connect
 
-HEADER = struct.Struct("<BBHIdd")  # kind, version, 0, samples a second; when it was sent, and heard or to be played
+HEADER = struct.Struct("<BBHIdd")  # kind, version, 0, samples a second; times of sending, and of recording or playback
 SPEECH, RATE_HZ = 3, 24_000
 HELLO = {"type": "hello", "version": 1, "name": "assistant", "feeds": ["speech"], "wants": ["microphone", "events"]}
 
 
 def answer(seconds: float) -> bytes:
-    """Stands for your recognition, language model and synthesis: a tone, as long as what was heard, 2 s at most."""
+    """Return a tone as long as the speech, at most 2 s; put your recognition, language model and synthesis here."""
     tone = np.sin(2 * np.pi * 180 * np.arange(round(min(seconds, 2.0) * RATE_HZ)) / RATE_HZ)
     return (6000 * tone).astype("<i2").tobytes()
 
@@ -33,7 +33,7 @@ with connect(sys.argv[1] if len(sys.argv) > 1 else "ws://127.0.0.1:8765") as rob
         sound = np.frombuffer(message, "<i2", offset=HEADER.size)
         loud = np.abs(sound.astype(float)).mean() > 300
         heard_s, quiet_s = (heard_s + 0.04, 0.0) if loud else (heard_s, quiet_s + 0.04)
-        if heard_s > 0.5 and quiet_s > 0.3:  # the person has said something, and pauses
-            now_s = time.monotonic()  # play it 0.2 s from now, on a loudspeaker of yours
+        if heard_s > 0.5 and quiet_s > 0.3:  # the person has spoken and pauses
+            now_s = time.monotonic()  # play it on your loudspeaker 0.2 s from now
             robot.send(HEADER.pack(SPEECH, 1, 0, RATE_HZ, now_s, now_s + 0.2) + answer(heard_s))
             heard_s = 0.0

@@ -1,4 +1,4 @@
-"""Draw a face from the JSON output alone, as any program beside the run can: json_avatar.py [PICTURES]."""
+"""Draw a face from the JSON output only, as any other program can: json_avatar.py [PICTURES]."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Your own listener: it nods when somebody has finished speaking. Any object with these four names will do."""
+"""Your own listener: it nods when the person has finished speaking. Any object with these four names works."""
 
 import sys
 
@@ -12,15 +12,15 @@ NOD_S = 0.6
 
 
 class PoliteListener:
-    hop = 1  # a plan with every frame ...
-    horizon = 4  # ... of the next four
+    hop = 1  # a plan every frame ...
+    horizon = 4  # ... for the next four
 
     def start(self, seed: int) -> tuple[float, float]:
-        """Memory: when the person was last heard, and when the last nod began."""
+        """Return the memory: when the person last spoke, and when the last nod began."""
         return -10.0, -10.0
 
     def step(self, speaker: sr.SpeakerFrame, memory: tuple[float, float]) -> tuple[sr.Plan | None, tuple[float, float]]:
-        """40 ms of the person in; a plan, and what to remember, out. Never changes `memory` in place."""
+        """Return a plan and the new memory for 40 ms of the person. Never change `memory` in place."""
         heard_s, nod_s = memory
         if len(speaker.audio) and np.abs(speaker.audio).max() > 0.02:
             heard_s = speaker.time_s

@@ -1,4 +1,4 @@
-"""Your own source: where the person's voice and face come from. Here a tone that comes and goes, and no face."""
+"""Your own source of the person's voice and face. This one has a tone that comes and goes, and no face."""
 
 import sys
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ RATE_HZ, FRAME_SAMPLES, FRAME_HZ = 16_000, 640, 25
 
 class Hum(sr.Source):
     def __init__(self, seconds: float) -> None:
-        self.duration_s = seconds  # None for something live
+        self.duration_s = seconds  # None for a live source
         self._given = 0
 
     def read(self, now_s: float) -> Sequence[sr.SpeakerFrame]:
-        """Frames of 40 ms that are complete at `now_s` and were not given yet. Called in the loop: must not block."""
+        """Return new frames of 40 ms that are complete at `now_s`. Called in the loop, so it must not block."""
         frames = []
         while (self._given + 1) / FRAME_HZ <= min(now_s, self.duration_s):
             seconds = (self._given * FRAME_SAMPLES + np.arange(FRAME_SAMPLES)) / RATE_HZ

@@ -6,8 +6,8 @@
     with open_bus(head, "sim") as bus: ...                servos alone
     with Robot("face28", port="sim") as robot: ...        all of it, in its own thread
 
-Every name is loaded when it is first used, so that importing this package costs nothing. docs/reference/api.md has
-them all.
+Each name is loaded when it is first used, so that importing this package costs nothing. docs/reference/api.md lists
+all names.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ __all__ = [
     "open_bus",
 ]
 
-# Module -> what comes from there. `Retargeter` is called otherwise in its module.
+# Module -> the public names that it defines. `Retargeter` has another name in its module (`_CALLED`).
 _NAMES: Final = {
     "app.api.listener_stream": ("ListenerStream", "LoadedListener", "load_listener"),
     "app.api.robot": ("Robot",),

@@ -1,4 +1,4 @@
-"""Paths of the package's files and the user's own; types of plain data; files that are written whole."""
+"""Paths of the package's files and of the user's files; types of plain data; writing of whole files."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any, Final, Literal
 
 from sfms_robot.errors import CHECKOUT, ConfigError, did_you_mean
 
-SPEAKER_VOICE: Final = "speech.flac"  # in the folder of each shipped speaker
+SPEAKER_VOICE: Final = "speech.flac"  # file in the folder of each shipped speaker
 _ARCHIVES: Final = {b"PK\x03\x04": "zip", b"7z\xbc\xaf": "7z", b"Rar!": "rar", b"BZh": "bz2", b"\xfd7zXZ": "xz"}
 
-NO_HEAD: Final = "none"  # the head without servos, which outputs alone show
+NO_HEAD: Final = "none"  # name of the head without servos, which only outputs show
 
-Names = tuple[str, ...]  # of joints, channels, causes
+Names = tuple[str, ...]  # names of joints, channels or causes
 Report = dict[str, Any]  # plain data, as --json prints it
 Shipped = Literal["configs", "firmware_maps", "sim"]
 
 
 def data_dir(name: Shipped) -> Path:
-    """Return the folder of shipped files: inside the installed package, else beside it in a checkout.
+    """Return a folder of shipped files: inside the installed package, else next to the package in a checkout.
 
-    Raises FileNotFoundError when neither exists, after a broken installation.
+    Raises FileNotFoundError if neither exists, which means that the installation is broken.
     """
     installed = Path(str(files("sfms_robot"))) / name
     if installed.is_dir():
@@ -41,7 +41,7 @@ def user_dir() -> Path:
 
 
 def archive_kind(data: bytes) -> str | None:
-    """Return the kind of archive that a file's first 300 bytes or more show, or None."""
+    """Return the kind of archive of a file, recognised by its first 300 bytes or more; None for any other file."""
     if data[257:262] == b"ustar":
         return "tar"
     return next((kind for mark, kind in _ARCHIVES.items() if data.startswith(mark)), None)
@@ -68,12 +68,12 @@ def speaker_names() -> list[str]:
 
 
 def head_file(name: str) -> Path:
-    """Return the file of a shipped head by name, or of another by path. Raises ConfigError."""
+    """Return the head.yaml of a shipped head by name, or of another head by path. Raises ConfigError."""
     return find("heads", name, "head.yaml") / "head.yaml"
 
 
 def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
-    """Return the folder of a shipped head or listener by name, or of another by path. Raises ConfigError."""
+    """Return the folder of a shipped head or listener by name, or of another one by path. Raises ConfigError."""
     root = data_dir("configs") / kind
     for folder in (root / name, Path(name)):
         if (folder / marker).is_file():
@@ -86,7 +86,7 @@ def find(kind: Literal["heads", "listeners"], name: str, marker: str) -> Path:
 
 
 def write_whole(file: Path, text: str) -> None:
-    """Write a file, its folder made, whole or not at all. Raises ConfigError."""
+    """Write a file completely or not at all; its folder is created if needed. Raises ConfigError."""
     new = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,9 @@
 """Addresses: parsing them, listening at them, and which clients a server of this program admits.
 
-A browser says whose page it shows (Origin) and which name it was given for this machine (Host). A name that a stranger
-gives to this machine's address proves nothing: a page of theirs would be of "the same origin". So a name that is not
-loopback must be an address, or a name that no stranger can own: one of the local network (.local, RFC 6762), or this
-machine's own.
+A browser sends the origin of its page (Origin) and the name by which it reached this machine (Host). That both are
+equal proves nothing: a stranger can let a name of their own point to this machine's address, and their page would then
+be of "the same origin". So a host that is not loopback must be an address, or a name that no stranger can own: one of
+the local network (.local, RFC 6762), or this machine's own name.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from sfms_robot.errors import InputError, PortError
 
 LOOPBACK: Final = "127.0.0.1"
 HIGHEST_PORT: Final = 65535
-LONGEST_NUMBER: Final = 20  # digits: those of 2**64. Python itself refuses from 4301 on, and floats end at 309
+LONGEST_NUMBER: Final = 20  # digits, as in 2**64. Python refuses 4301 digits and more; floats end at 309
 
 
 def whole_number(text: str) -> int:
-    """Return the whole number that `text` says. Raises an InputError of one line for another text, or a longer number.
+    """Return the whole number in `text`. Raises InputError, in one line, for any other text or a longer number.
 
-    Also for `json.loads(parse_int=...)`: an InputError is a ValueError too.
+    It can also be used as `json.loads(parse_int=...)`, since InputError is a ValueError.
     """
     digits = text.lstrip("+-")
     if not (digits.isascii() and digits.isdigit() and len(digits) <= LONGEST_NUMBER):
@@ -39,7 +39,7 @@ def whole_number(text: str) -> int:
 
 
 def port_number(text: str, least: int = 0) -> int | None:
-    """Return a TCP or UDP port from `least` on; None for any other text. 0 asks for any that is free."""
+    """Return the TCP or UDP port in `text`, `least` or higher; None for any other text. 0 requests any free port."""
     try:
         number = whole_number(text)
     except InputError:
@@ -48,7 +48,7 @@ def port_number(text: str, least: int = 0) -> int | None:
 
 
 def host_and_port(text: str, least: int = 0) -> tuple[str, int] | None:
-    """Return host and port of PORT, HOST:PORT or [HOST]:PORT (IPv6), loopback without a host; None for another form."""
+    """Return (host, port) of PORT (on loopback), HOST:PORT or [HOST]:PORT (IPv6); None for any other form."""
     host, colon, number = text.rpartition(":")
     port = port_number(number, least)
     if port is None or (colon and not host):
@@ -57,15 +57,15 @@ def host_and_port(text: str, least: int = 0) -> tuple[str, int] | None:
 
 
 def address_text(host: str, port: int) -> str:
-    """Return an address as people write it: an IPv6 host in brackets."""
+    """Return an address as HOST:PORT, with an IPv6 host in brackets."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def listen(flag: str, host: str, port: int, others: int = 0) -> socket.socket:
     """Return a TCP socket that listens at an address, or on the first free one of the next `others` ports.
 
-    Port 0: any that is free, which is also the last resort where there are `others`. `flag` names the option in the
-    error. Raises PortError.
+    Port 0 means any free port; it is also tried last unless `others` is 0. `flag` is the option that the error names.
+    Raises PortError.
     """
     ports = [*range(port, min(port + others, HIGHEST_PORT + 1)), 0] if port and others else [port]
     for each in ports:
@@ -83,7 +83,7 @@ def listen(flag: str, host: str, port: int, others: int = 0) -> socket.socket:
 
 
 def leads_here(address: str, port: int) -> bool:
-    """Return whether HOST:PORT is this machine at `port`. Asks no name server."""
+    """Return whether HOST:PORT is this machine at `port`. Sends no query to a name server."""
     host, at = host_and_port(address) or ("", 0)
     name = socket.gethostname()
     named = host in ("localhost", name, f"{name}.local", "0.0.0.0", "::", *addresses_of_this_machine())
@@ -107,9 +107,10 @@ def connect(address: str) -> socket.socket:
 
 
 def origin_problem(origin: str | None, host: str) -> str | None:
-    """Return why a page may not connect; None where it may, and for clients that are not browsers (`origin` None).
+    """Return the reason why a page may not connect; None if it may.
 
-    `host`: the name of this machine in the request, with or without a port.
+    `origin` is None for clients that are not browsers, which may connect. `host`: the name of this machine in the
+    request, with or without a port.
     """
     if origin is None:
         return None
@@ -122,18 +123,18 @@ def origin_problem(origin: str | None, host: str) -> str | None:
 
 
 def host_problem(host: str) -> str | None:
-    """Return why a request that calls this machine `host` is not answered; None where it is."""
+    """Return the reason to refuse a request that names this machine `host`; None if it is accepted."""
     name = _host(f"//{host}")
     return None if name is not None and (name == "localhost" or _ours(name)) else f"{host[:80]!r} is not here"
 
 
 def token_admits(given: str, token: str | None) -> bool:
-    """Return whether a client with this token is admitted; `token` None: any. Takes as long for any wrong one."""
+    """Return whether a client is admitted; `token` None admits any. The time is the same for all wrong tokens."""
     return token is None or hmac.compare_digest(given.encode(), token.encode())
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether `host` is an address of this machine alone."""
+    """Return whether `host` is a loopback address, which only this machine can reach."""
     address = _address(host)
     return address is not None and address.is_loopback
 
@@ -162,7 +163,7 @@ def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
 
 
 def addresses_of_this_machine() -> list[str]:
-    """Return IPv4 addresses by which other machines may find this one; sends nothing. Empty where they are unknown."""
+    """Return the IPv4 addresses by which other machines may reach this one; empty if unknown. Sends nothing."""
     if sys.platform != "linux":
         try:
             found = socket.gethostbyname_ex(socket.gethostname())[2]
@@ -183,14 +184,14 @@ def addresses_of_this_machine() -> list[str]:
 
 
 class ServerThread:
-    """A thread with an event loop for a server, at an address that is held from construction until `close`.
+    """A thread with an event loop for a server, whose address is bound from construction until `close`.
 
     A subclass defines `_serve`, which serves `_socket` and returns soon after `_closing` is set.
 
-    Args: `flag`, `host`, `port` as of `listen`. Raises PortError.
+    Args: `flag`, `host`, `port` as for `listen`. Raises PortError.
 
     Attributes:
-        address: host and port that are bound.
+        address: the bound host and port.
     """
 
     def __init__(self, flag: str, host: str, port: int, stop_s: float) -> None:
@@ -203,17 +204,17 @@ class ServerThread:
         self._thread = threading.Thread(target=self._run, name=flag, daemon=True)
 
     def start(self) -> None:
-        """Take connections from now on. Idempotent."""
+        """Accept connections from now on. Idempotent."""
         if self._thread.ident is None:
             self._thread.start()
 
     def close(self) -> None:
-        """Close every connection and give the port back. Blocks `stop_s` at most. Idempotent."""
+        """Close every connection and release the port. Blocks `stop_s` at most. Idempotent."""
         if self._thread.ident is None:
             self._loop.close()
             self._socket.close()
         elif self._thread.is_alive():
-            with suppress(RuntimeError):  # it has ended meanwhile
+            with suppress(RuntimeError):  # the thread has ended meanwhile
                 self._loop.call_soon_threadsafe(self._closing.set)
             self._thread.join(self._stop_s)
 

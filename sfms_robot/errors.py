@@ -3,15 +3,15 @@
 RobotError                      base; `exit_code` is what the command line returns
 +-- ConfigError          (2)    a file, a flag or a value in it is wrong; names file, key, value, choices
 |   +-- MissingExtra     (2)    a feature needs an optional package that is not installed; names the pip install
-|   +-- InputError       (2)    a value that a program handed over: its shape, its range, not finite
+|   +-- InputError       (2)    a value passed by a program has a wrong shape or range, or is not finite
 +-- PortError            (3)    a port cannot be opened, or another program holds it
-+-- OutputError          (3)    an output's peer is away, refuses, or answers in another way than it should
-+-- BusError             (4)    no servo of a bus answers; the bus cannot go on
++-- OutputError          (3)    an output's peer is unreachable, refuses, or does not answer as it should
++-- BusError             (4)    no servo of a bus answers; the bus cannot continue
 |   +-- TorqueError      (4)    torque could not be confirmed off; names the joints
-+-- ServoError           (4)    a servo is not what the configuration says, or refuses a command
++-- ServoError           (4)    a servo contradicts the configuration, or refuses a command
 +-- PacketError          (4)    bytes that are not a packet (codecs raise it, buses count it)
 +-- ModelError           (5)    weights or model files are missing, corrupt or of another shape
-+-- HaltedError          (1)    an emergency stop cannot be ended now, or not from here; names what keeps it
++-- HaltedError          (1)    an emergency stop cannot be ended now, or not from here; names its cause
 +-- GroupError           (1)    a process that trains with this one is gone
 """
 
@@ -25,19 +25,19 @@ from pathlib import Path
 from shlex import quote
 from typing import Final
 
-MOST_SAID: Final = 20  # problems of one source, so that nothing floods the log
+MOST_SAID: Final = 20  # most problems that are logged of one source, so that the log is not flooded
 INTERRUPTED: Final = 130  # exit code of a command that Ctrl-C or SIGTERM ended, after the safe stop
-CHECKOUT: Final = Path(__file__).resolve().parent.parent  # if there is a pyproject.toml in it
-NOTE: Final = 25  # level of a log line that informs: shown as a plain line. A WARNING is something to act on.
+CHECKOUT: Final = Path(__file__).resolve().parent.parent  # a checkout only if it has a pyproject.toml
+NOTE: Final = 25  # level of a log line that only informs: shown as a plain line. A WARNING calls for action.
 
 
 class RobotError(Exception):
-    """Base of every error this package raises on purpose. The text is one line for a person."""
+    """Base class of every error that this package raises on purpose. Its text is one line for the user."""
 
     exit_code = 1
 
 
-_MOST_LISTED = 20  # choices beside the one that was meant
+_MOST_LISTED = 20  # longest list of choices that is printed together with a suggestion
 
 
 class ConfigError(RobotError):
@@ -54,7 +54,7 @@ class ConfigError(RobotError):
         problem: str,
         choices: Iterable[object] = (),
     ) -> ConfigError:
-        """`file: key = value problem (valid choices)`, the form every configuration error takes."""
+        """Return an error `file: key = value problem (valid choices)`, the form of every configuration error."""
         names = [str(choice) for choice in choices]
         meant = did_you_mean(value, names) if len(names) > 1 else ""
         listed = f" ({', '.join(names)})" if names and not (meant and len(names) > _MOST_LISTED) else ""
@@ -62,7 +62,7 @@ class ConfigError(RobotError):
 
 
 def did_you_mean(given: object, choices: Iterable[str]) -> str:
-    """Return `; did you mean 'NAME'?` with the choice that a misspelt name is closest to, or ''; case is ignored."""
+    """Return `; did you mean 'NAME'?` with the choice closest to a misspelt name, or ''; case is ignored."""
     from difflib import get_close_matches
 
     known = {choice.lower(): choice for choice in choices}
@@ -81,9 +81,9 @@ class MissingExtra(ConfigError):
 
 
 class InputError(ConfigError, ValueError):
-    """A value handed to a function of this package cannot be used: its shape, its range, or it is not finite.
+    """A value passed to a function of this package has a wrong shape or range, or is not finite.
 
-    A ValueError too, as Python's own are.
+    It is also a ValueError, which Python itself raises for such values.
     """
 
 
@@ -94,7 +94,7 @@ class PortError(RobotError):
 
 
 class OutputError(RobotError):
-    """The peer of an output is away, refuses, or is something else. The run continues without it."""
+    """The peer of an output is unreachable, refuses, or is another program. The run continues without it."""
 
     exit_code = 3
 
@@ -106,7 +106,7 @@ class BusError(RobotError):
 
 
 class TorqueError(BusError):
-    """Torque of `joints` that could not be confirmed off at the end."""
+    """Torque of `joints` could not be confirmed off at the end."""
 
     def __init__(self, joints: Iterable[str]) -> None:
         super().__init__(
@@ -116,7 +116,7 @@ class TorqueError(BusError):
 
 
 class ServoError(RobotError):
-    """One servo is not what the head configuration says, or refused a command. The bus continues."""
+    """One servo contradicts the head configuration, or refused a command. The bus continues."""
 
     exit_code = 4
 
@@ -134,14 +134,14 @@ class ModelError(RobotError):
 
 
 class HaltedError(RobotError):
-    """An emergency stop that cannot be ended: a cause is still active, or is to be cleared elsewhere."""
+    """An emergency stop cannot be ended: a cause is still active, or must be cleared elsewhere."""
 
 
 class GroupError(RobotError):
-    """A process that trains with this one is gone. The last checkpoint stands."""
+    """A process that trains with this one is gone. The last checkpoint remains valid."""
 
 
-# Optional packages by the name that is imported, with the extra of pyproject.toml that brings each.
+# Import name of each optional package -> the extra of pyproject.toml that installs it.
 EXTRA_OF: Final[Mapping[str, str]] = {
     "torch": "train",
     "tensorboard": "train",
@@ -163,15 +163,15 @@ EXTRA_OF: Final[Mapping[str, str]] = {
 
 
 def first_line(error: BaseException) -> str:
-    """Return the first line of what an error says; the name of its class where it says nothing."""
+    """Return the first line of an error's message, or the name of its class if the message is empty."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]
 
 
 class Said(set[str]):
-    """Problems of a source of many that were said, whatever their numbers: each once, and `MOST_SAID` at most."""
+    """Problems of one source that were reported already: each once whatever its numbers, `MOST_SAID` at most."""
 
     def first(self, problem: str) -> bool:
-        """Return whether a problem has not been said, and is to be."""
+        """Return whether to report a problem, and note it as reported."""
         kind = re.sub(r"got .*|[\d.]+", "", problem)
         new = kind not in self and len(self) < MOST_SAID
         if new:
@@ -181,7 +181,7 @@ class Said(set[str]):
 
 @contextmanager
 def optional(feature: str) -> Iterator[None]:
-    """Raise MissingExtra where an optional package is missing that is imported inside. `feature` names its user."""
+    """Raise MissingExtra if an optional package imported inside is missing. `feature` names the code that needs it."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -194,10 +194,10 @@ def optional(feature: str) -> Iterator[None]:
 
 
 def install_command(extra: str) -> str:
-    """Return the command that adds an extra to this installation, to be typed in the present folder.
+    """Return the command that adds an extra to this installation, to be typed in the current folder.
 
-    It names the pip of this Python: where `.venv` is not activated, plain `pip` is another one. In a checkout it
-    installs that, in place; else pip finds sfms-robot installed, and adds only what the extra needs.
+    It names the pip of this Python, since plain `pip` is another one if `.venv` is not activated. In a checkout it
+    installs the checkout in place; else pip finds sfms-robot installed, and adds only what the extra needs.
     """
     from shutil import which
 
@@ -210,5 +210,5 @@ def install_command(extra: str) -> str:
 
 
 def _within(folder: Path, path: Path) -> str:
-    """Return `path`, relative to `folder` where it lies in it."""
+    """Return `path`, relative to `folder` if it lies inside."""
     return str(path.relative_to(folder) if path.is_relative_to(folder) else path)

@@ -1,4 +1,4 @@
-"""The values that travel through the program, and the one table of channel names.
+"""The values that the parts of the program exchange, and the table of channel names.
 
 Axes are ROS REP-103: x forward, y left, z up. Roll + = right ear down, pitch + = nose down, yaw + = turn to
 the head's own left; R = Rz(yaw) Ry(pitch) Rx(roll). Left and right are the head's own, as in ARKit.
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
-Reals = NDArray[np.floating]  # of either precision
+Reals = NDArray[np.floating]  # floats of either precision
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 Indices = NDArray[np.intp]
@@ -32,7 +32,7 @@ SILENCE: Final = np.zeros(FRAME_SAMPLES, np.float32)
 SILENCE.flags.writeable = False
 
 POSE_CHANNELS: Final = ("roll", "pitch", "yaw", "x", "y", "z")
-LATERAL_POSE: Final = ("roll", "yaw", "y")  # those of them that a mirror turns around
+LATERAL_POSE: Final = ("roll", "yaw", "y")  # pose channels whose sign a mirror image reverses
 
 # The order of Apple's ARKit header (eyes, jaw, mouth, brows, cheeks, nose, tongue).
 _APPLE: Final = (
@@ -60,9 +60,9 @@ NEUTRAL: Final = np.zeros(MOTION_DIM, np.float32)  # the motion of a neutral fac
 NEUTRAL.flags.writeable = False
 YAW_PITCH: Final = np.array([CHANNEL_INDEX["yaw"], CHANNEL_INDEX["pitch"]])
 BLINKS: Final = slice(CHANNEL_INDEX["eyeBlinkLeft"], CHANNEL_INDEX["eyeBlinkRight"] + 1)
-SMILE_CORNERS: Final = ("mouthSmileLeft", "mouthSmileRight")  # of the mouth: what tells a smile
+SMILE_CORNERS: Final = ("mouthSmileLeft", "mouthSmileRight")  # corners of the mouth, which show a smile
 
-# Columns of each motion space a listener may work in (`listeners.space`); arkit58 is a motion array itself.
+# Columns of each motion space that a listener may use (`listeners.space`); arkit58 is the motion array itself.
 _AXES: Final = ("x", "y", "z")
 SPACE_CHANNELS: Final[Mapping[str, tuple[str, ...]]] = {
     "arkit58": CHANNELS,
@@ -70,7 +70,7 @@ SPACE_CHANNELS: Final[Mapping[str, tuple[str, ...]]] = {
     "deca56": (*(f"expression_{i}" for i in range(50)), *(f"head_{a}" for a in _AXES), *(f"jaw_{a}" for a in _AXES)),
 }
 
-JAW_FULL_OPEN_RAD: Final = math.radians(25.0)  # jaw pitch that stands for jawOpen = 1
+JAW_FULL_OPEN_RAD: Final = math.radians(25.0)  # jaw pitch that corresponds to jawOpen = 1
 PITCH_CHANNEL: Final[Mapping[str, str]] = {"arkit58": "pitch", "faceverse58": "rotation_x", "deca56": "head_x"}
 
 
@@ -95,9 +95,9 @@ def clip_shapes(motion: Reals) -> None:
 
 
 def changed(value: Value, **fields: object) -> Value:
-    """Replace fields as `dataclasses.replace`, in an eighth of its time, for values without checks.
+    """Return a copy with some fields replaced, as `dataclasses.replace` does, in an eighth of its time.
 
-    Memories of streams are replaced with every frame.
+    For classes without checks only. It is used for the memories of streams, which are replaced with every frame.
     """
     made: Value = object.__new__(type(value))
     made.__dict__.update(value.__dict__, **fields)
@@ -109,7 +109,7 @@ class FaceFrame:
     """One face at one instant.
 
     Attributes:
-        time_s: when.
+        time_s: time of the face.
         pose: (6,) roll, pitch, yaw [rad], x, y, z [m].
         blendshapes: (52,) 0..1, order `BLENDSHAPES`.
         jaw_rad: (3,) axis-angle or None; when present it replaces jawOpen.
@@ -128,7 +128,7 @@ class FaceFrame:
 
     @property
     def motion(self) -> Floats:
-        """(58,) pose then blendshapes."""
+        """Return the motion (58,): pose, then blendshapes."""
         return np.concatenate([self.pose, self.blendshapes]).astype(np.float32)
 
 
@@ -138,8 +138,8 @@ class Sighting:
 
     Attributes:
         face: pose and blendshapes; its `time_s` is loop time.
-        attention: 0..1, of the person to the head; None if unknown.
-        place_m: (3,) place of their eyes in the camera's frame: x out of its lens, y to its left, z up; None if
+        attention: attention of the person to the head, 0..1; None if unknown.
+        place_m: (3,) place of the person's eyes in the camera's frame: x out of its lens, y to its left, z up; None if
             unknown.
     """
 
@@ -157,8 +157,8 @@ class SpeakerFrame:
         audio: (n,) mono 16 kHz, -1..1; empty when there is no microphone.
         face: the person's face, or None: a missing modality is normal.
         agent_audio: (n,) voice of the robot itself, or None.
-        attention, place_m: see `Sighting`; None without a face. In a meeting that is played back an attention may be
-            NaN: several people are there, and the target of this one's look was not annotated.
+        attention, place_m: see `Sighting`; None without a face. In a meeting that is played back the attention may be
+            NaN: several people are present, and the target of this person's gaze was not annotated.
     """
 
     time_s: float
@@ -174,7 +174,8 @@ class SpeakerFrame:
         return round(self.time_s * FRAME_HZ) - 1
 
 
-# What a listener may decide to do. A laugh is heard and opens the mouth, a smile is only seen; "mm-hm" is for a voice.
+# Kinds of events that a listener may decide. A laugh is audible and opens the mouth, a smile is only visible; "mm-hm"
+# needs a voice.
 EVENT_KINDS: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "blink", "gaze_shift")
 
 
@@ -183,16 +184,17 @@ class ListenerEvent:
     """An event that a listener has decided, or that a person showed.
 
     Attributes:
-        kind: of `EVENT_KINDS`.
-        start_s, duration_s: when its motion begins and how long it lasts; a gaze shift lasts until the next one.
-        size: peak to peak [rad] of a nod, a shake, a tilt; 0..1 of an event of the face; angle [rad] of a gaze shift.
-        swings: of a nod or a shake, there and back each; 1 of everything else.
-        target_rad: (yaw, pitch) in space that a gaze shift goes to, (0, 0) at the person; None of everything else.
-        probability, draw: that it would be decided at this instant, and the number in 0..1 that fell below it; None
-            for what was not drawn.
+        kind: one of `EVENT_KINDS`.
+        start_s, duration_s: start and length of its motion; a gaze shift lasts until the next one.
+        size: peak-to-peak angle [rad] of a nod, a shake, a tilt; 0..1 for an event of the face; angle [rad] of a gaze
+            shift.
+        swings: number of swings, there and back, of a nod or a shake; 1 for all other kinds.
+        target_rad: target (yaw, pitch) in space of a gaze shift, (0, 0) at the person; None for all other kinds.
+        probability, draw: probability of the decision at this instant, and the random number in 0..1 that fell below
+            it; None for an event that was not drawn.
         evidence: the largest terms of its log-odds, by name.
-        origin_s: `time.monotonic` at 0 of the clock that its times are on, that of the run's frames, where `Robot.on`
-            hands it over; in virtual time 0; None elsewhere.
+        origin_s: `time.monotonic` at time 0 of its clock, which is the clock of the run's frames, if the event comes
+            from `Robot.on`; 0 in virtual time; None elsewhere.
     """
 
     kind: str
@@ -212,7 +214,7 @@ class ListenerEvent:
 
     @property
     def starts_monotonic_s(self) -> float | None:
-        """`start_s` by `time.monotonic`, as `Robot.say(at_s=)` takes it; None without a run."""
+        """Return `start_s` on the clock of `time.monotonic`, as `Robot.say(at_s=)` expects it; None without a run."""
         return None if self.origin_s is None else self.origin_s + self.start_s
 
 
@@ -221,15 +223,15 @@ Events = tuple[ListenerEvent, ...]
 
 @dataclass(frozen=True)
 class Plan:
-    """The next motion of our face. A newer plan replaces an older one from its first time on.
+    """The next motion of the robot's face. A newer plan replaces an older one from its first time on.
 
     Attributes:
         made_at_s: time of the last speaker frame used.
         times_s: (H,) times_s[0] = made_at_s + one frame.
         frames: (H, 58) motion.
         jaw_rad: (H, 3) or None.
-        events: decided since the plan before, each once; empty for a listener without events.
-        hazards_hz: by kind, rate of decisions at this moment; empty for a listener without events.
+        events: events decided since the previous plan, each once; empty for a listener without events.
+        hazards_hz: current rate of decisions, by kind; empty for a listener without events.
     """
 
     made_at_s: float
@@ -249,8 +251,8 @@ class Reading:
         age_s: age of the position; inf when there is none.
         fault: named fault or None.
         extra: other values of the family, unit in the key (`current_mA`, `velocity_rad_s`, `voltage_V`).
-        rejoined: true once, when the servo was away and holds this position now, or the newest goal where it has no
-            position to tell; its goals are left out until they begin there, so ease in from it.
+        rejoined: true once, when the servo was lost and now holds this position, or the newest goal if it reports no
+            position. Its goals are left out until they begin there, so ease in from it.
     """
 
     position_rad: float | None
@@ -260,4 +262,4 @@ class Reading:
     rejoined: bool = False
 
 
-Readings = Mapping[str, Reading]  # by joint
+Readings = Mapping[str, Reading]  # readings by joint

@@ -1,9 +1,9 @@
 """Sessions of zenoh (zenoh.io), which carries the messages between robots and servers.
 
 Without a configuration everything stays on this machine: a server listens on 127.0.0.1:7447, a robot connects there,
-without multicast scouting. A file of zenoh's own form (JSON5: endpoints, TLS, access control)
-replaces all that; docs/guide/remote.md has one for TLS with certificates of both sides. An endpoint that is neither
-on loopback nor encrypted needs `--insecure`.
+without multicast scouting. A configuration file of zenoh (JSON5: endpoints, TLS, access control) replaces all these
+settings; docs/guide/remote.md has one for TLS with certificates of both sides. An endpoint that is neither on loopback
+nor encrypted needs `--insecure`.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from sfms_robot.errors import ConfigError, PortError, RobotError, Said, first_li
 if TYPE_CHECKING:
     import zenoh
 
-PORT: Final = 7447  # zenoh's own
+PORT: Final = 7447  # zenoh's default
 LOOPBACK: Final = f"tcp/127.0.0.1:{PORT}"
-LEASE_MS: Final = 2000  # a link that is silent for so long is dead, and is opened again
-QUEUE: Final = 16  # messages that wait for a busy machine, the most that zenoh takes; with its own 2 frames are lost
+LEASE_MS: Final = 2000  # a link that is silent for this long counts as dead, and is opened again
+QUEUE: Final = 16  # messages queued for a busy machine, zenoh's maximum; with its default of 2, frames are lost
 RETRY: Final = {"period_init_ms": 250, "period_max_ms": 250, "period_increase_factor": 1.0}
-AWAY_S: Final = 5.0  # without a router, after which that is reported
+AWAY_S: Final = 5.0  # time without a router, after which that is reported
 SAFE: Final = ("tls", "quic", "unixsock-stream", "unixpipe", "serial", "vsock")  # encrypted, or not a network
 
 Role = Literal["serve", "call"]
@@ -42,10 +42,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Router:
-    """The router that a session connects to, or is.
+    """The router that a session connects to, or acts as.
 
     Attributes:
-        file: zenoh's configuration; None for loopback.
+        file: configuration file of zenoh; None for loopback.
         insecure: allow endpoints beyond loopback without TLS.
     """
 
@@ -66,17 +66,17 @@ def check_zenoh() -> None:
 
 
 def check_name(name: str, what: str) -> str:
-    """Return `name`, which becomes a part of keys. Raises ConfigError for one that cannot."""
+    """Return `name`, which becomes a part of keys. Raises ConfigError for a name that cannot be one."""
     if not re.fullmatch(r"[\w.-]+", name, re.ASCII):
         raise ConfigError(f"{what}: expected a name of letters, digits, '-', '_' and '.', got {name!r}")
     return name
 
 
 def session_config(role: Role, router: Router = LOCAL) -> zenoh.Config:
-    """Return how a session connects: as the router's file says, else on loopback.
+    """Return the configuration of a session: that of the router's file, else loopback.
 
-    Raises ConfigError for a file that zenoh does not take, or that anyone on the network could use; MissingExtra
-    without zenoh.
+    Raises ConfigError for a file that zenoh rejects, or that admits anyone on the network; MissingExtra without
+    zenoh.
     """
     check_zenoh()
     import zenoh
@@ -86,7 +86,7 @@ def session_config(role: Role, router: Router = LOCAL) -> zenoh.Config:
             raise ConfigError(f"{file}: no such file (a configuration of zenoh, JSON5)")
         try:
             given = zenoh.Config.from_file(str(file))
-        except Exception as error:  # zenoh raises its own and plain exceptions alike
+        except Exception as error:  # zenoh raises both its own and plain exceptions
             raise ConfigError(f"{file}: zenoh cannot use it: {_first_line(error)}") from error
         if not router.insecure:
             _check_secure(given, file)
@@ -102,7 +102,7 @@ def session_config(role: Role, router: Router = LOCAL) -> zenoh.Config:
         "connect/endpoints": [] if serves else [LOOPBACK],
     }
     if not serves:
-        settings["connect/timeout_ms"] = -1  # for ever; `Connection` waits in a thread
+        settings["connect/timeout_ms"] = -1  # no limit; `Connection` waits in a thread
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -150,13 +150,13 @@ def close_session(session: Any) -> None:
 
 
 class Connection:
-    """A session that is being opened in a thread, for as long as its router is away.
+    """A session that is opened in a thread, which waits for as long as the router is unreachable.
 
     Attributes:
         session: None while no router answers.
-        problem: why it cannot be opened; None as long as it may.
+        problem: reason why it cannot be opened; None as long as it may still open.
 
-    begin: called with the session in that thread, before others see it.
+    `begin` is called with the session in that thread, before `session` is set.
     """
 
     def __init__(self, config: zenoh.Config, begin: Callable[[zenoh.Session], None] = lambda session: None) -> None:
@@ -168,7 +168,7 @@ class Connection:
         threading.Thread(target=self._open, name="zenoh", daemon=True).start()
 
     def wait(self, limit_s: float) -> zenoh.Session | None:
-        """Wait for the session; return None when it is not open by then. Raises PortError when it cannot be opened."""
+        """Wait for the session; return None if it is not open in time. Raises PortError if it cannot be opened."""
         with self._changed:
             self._changed.wait_for(lambda: self.session is not None or self.problem is not None, limit_s)
         if self.problem is not None:
@@ -203,7 +203,7 @@ class Connection:
 
 
 def _first_line(error: BaseException) -> str:
-    """Return the message of zenoh, without the places in its source."""
+    """Return the first line of a message of zenoh, without the places in its source."""
     return first_line(error).partition(" at /")[0].rstrip(".")
 
 
@@ -211,11 +211,11 @@ def _first_line(error: BaseException) -> str:
 
 MOST_DOMAIN: Final = 232
 ROUTER_OF_ROS: Final = "ros2 run rmw_zenoh_cpp rmw_zenohd"
-_QOS: Final = "::,10:,:,:,,"  # all defaults: reliable, volatile, the last ten
+_QOS: Final = "::,10:,:,:,,"  # all defaults: reliable, volatile, the last ten messages
 
 
 def ros_domain(text: str, flag: str) -> int:
-    """Return the domain that `text` gives, else ROS_DOMAIN_ID, else 0. Raises ConfigError."""
+    """Return the domain in `text`, else in ROS_DOMAIN_ID, else 0. Raises ConfigError."""
     given = text or os.environ.get("ROS_DOMAIN_ID", "") or "0"
     domain = port_number(given)
     if domain is None or domain > MOST_DOMAIN:
@@ -226,7 +226,7 @@ def ros_domain(text: str, flag: str) -> int:
 
 
 def ros_topic(text: str, flag: str) -> str:
-    """Return a topic with its leading slash. Raises ConfigError for a text that ROS does not take."""
+    """Return a topic with its leading slash. Raises ConfigError for a text that is not a topic of ROS."""
     topic = "/" + text.removeprefix("/")
     if not re.fullmatch(r"(/\w+)+", topic, re.ASCII):
         raise ConfigError(f"{flag}: expected a topic such as /audio (letters, digits, '_', '/'), got {text!r}")
@@ -234,23 +234,23 @@ def ros_topic(text: str, flag: str) -> str:
 
 
 class Ros2Node:
-    """A node of ROS 2, by what its middleware rmw_zenoh sends (docs/design.md of github.com/ros2/rmw_zenoh).
+    """A ROS 2 node that speaks the protocol of its middleware rmw_zenoh (docs/design.md of github.com/ros2/rmw_zenoh).
 
         message    DOMAIN/TOPIC/TYPE/HASH; attached: i64 number, i64 time in ns, u8 16, 16 bytes that name the sender
         presence   @ros2_lv/DOMAIN/SESSION/NODE/ENTITY/NN|MP|MS/ENCLAVE/NAMESPACE/NAME[/TOPIC/TYPE/HASH/QOS]
 
-    TOPIC goes without its first slash in the former, and with % for each in the latter. TYPE/HASH is a "wire name"
-    here (`signals.ros2_messages`). Nothing is waited for; a router that is away is found again by zenoh.
+    TOPIC is written without its first slash in the former, and with % for each slash in the latter. TYPE/HASH is called
+    "wire name" here (`signals.ros2_messages`). Only `wait` blocks; zenoh finds a lost router again.
 
     Args:
-        name: of the node, and in logs.
-        sends, takes: wire name by topic, of what is published, and what is subscribed.
-        received: called in a thread of zenoh with topic, wire name and bytes of each message, of any type. What it
-            raises as RobotError is logged, each reason once.
-        limit_s: after which a router that is away ends the node; None: it is waited for.
+        name: name of the node, also used in logs.
+        sends, takes: wire name by topic, of published and of subscribed topics.
+        received: called in a thread of zenoh with topic, wire name and bytes of each message, of any type. A RobotError
+            that it raises is logged, each reason once.
+        limit_s: time without a router after which connecting fails for good; None: no limit.
 
     Attributes:
-        counts: messages sent, received and refused.
+        counts: numbers of messages sent, received and refused.
     """
 
     def __init__(
@@ -270,15 +270,15 @@ class Ros2Node:
         self._numbers = dict.fromkeys(self._sends, 0)
         self._gid = b"\x10" + secrets.token_bytes(16)
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._seen = set[tuple[str, str]]()  # topic and domain of publishers
+        self._seen = set[tuple[str, str]]()  # topic and domain of the publishers that are present
         self._said = Said()
-        self._kept: list[Any] = []  # what is declared, for as long as the node lives
+        self._kept: list[Any] = []  # declared tokens and subscribers, kept as long as the node
         config = session_config("call", router)
         config.insert_json5("connect/timeout_ms", "-1" if limit_s is None else str(round(1e3 * limit_s)))
         self._connection = Connection(config, self._declare)
 
     def wait(self, limit_s: float) -> bool:
-        """Wait for a router; return whether there is one now. Raises PortError where none can be reached for good."""
+        """Wait for a router; return whether the node is connected. Raises PortError if connecting failed for good."""
         self._connection.wait(limit_s)
         return self.connected
 
@@ -295,14 +295,14 @@ class Ros2Node:
         return bool(getattr(publisher.matching_status, "matching", False))  # an object, though declared as bool
 
     def publish(self, topic: str, data: bytes, time_ns: int) -> None:
-        """Send a message of one of `sends`; without a router it is dropped."""
+        """Send a message on a topic of `sends`; without a router it is dropped."""
         if (publisher := self._publishers.get(topic)) is not None:
             self._numbers[topic] += 1
             self.counts["sent"] += 1
             publisher.put(data, attachment=struct.pack("<qq", self._numbers[topic], time_ns) + self._gid)
 
     def absence(self, topic: str) -> str:
-        """Return why nothing may have come of a topic of `takes`, and what to do, in one line."""
+        """Return, in one line, why a topic of `takes` may have received nothing, and what to do."""
         if not self.connected:
             return f"no router at {self.where} ({ROUTER_OF_ROS}; another by --zenoh FILE)"
         domains = {domain for seen, domain in self._seen.copy() if seen == topic}
@@ -312,11 +312,11 @@ class Ros2Node:
         return f"no publisher of {topic} in domain {self.domain}{others}"
 
     def close(self) -> None:
-        """Leave the graph. Idempotent."""
+        """Leave the ROS graph. Idempotent."""
         self._connection.close()
 
     def _declare(self, session: zenoh.Session) -> None:
-        """Make the node, its publishers and subscribers present."""
+        """Declare the node, its publishers and its subscribers."""
         import zenoh
 
         def token(kind: str, entity: int, *more: str) -> None:
@@ -332,7 +332,7 @@ class Ros2Node:
         for entity, (topic, wire) in enumerate(self._takes.items(), 1 + len(self._sends)):
             mangled = topic.replace("/", "%")
             token("MS", entity, mangled, wire, _QOS)
-            # Of any type and hash: a wrong one is worth a line.
+            # Any type and hash is subscribed, so that a wrong one is reported.
             self._kept.append(session.declare_subscriber(f"{self.domain}{topic}/*/*", partial(self._take, topic)))
             others, note = f"@ros2_lv/*/*/*/*/MP/*/*/*/{mangled}/**", partial(self._note_publisher, topic)
             self._kept.append(live.declare_subscriber(others, note, history=True))
@@ -349,7 +349,7 @@ class Ros2Node:
         except RobotError as error:
             self._say(topic, str(error))
             self.counts["refused"] += 1
-        self.counts["received"] += 1  # last: a message that is counted has been taken, or refused
+        self.counts["received"] += 1  # last, so that a counted message was processed or refused
 
     def _say(self, topic: str, reason: str) -> None:
         if self._said.first(topic + reason):

@@ -1,10 +1,10 @@
 """Plug-ins of other packages: entry points of the groups `sfms_robot.listeners`, `.sources`, `.outputs` and `.buses`.
 
-An entry of the first three names a callable that takes the text behind the colon of NAME:ARGUMENT ("" without one) and
+An entry of the first three names a callable that accepts the text after the colon of NAME:ARGUMENT ("" without one) and
 returns a `ports.Listener`, a source or a `ports.Output`; an entry of the last names a `servo.families.BusFamily`. They
-are imported only where they are used. Shipped names and folders go first.
+are imported only when they are used. Shipped names and folders take precedence.
 
-A plug-in that fails is a ConfigError of one line for the user who named it. For all others it is left out.
+A plug-in that fails causes a ConfigError of one line for the user who named it. For all others it is left out.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any, Final
 from sfms_robot.data import find
 from sfms_robot.errors import ConfigError, RobotError, first_line
 
-if TYPE_CHECKING:  # numpy, which a look at a name does not need
+if TYPE_CHECKING:  # imports numpy, which is not needed to look up a name
     from sfms_robot.ports import Listener
 
 GROUP: Final = "sfms_robot.listeners"
-REMOTE: Final = "zenoh/"  # begins the name of a listener on another machine (`remote`)
+REMOTE: Final = "zenoh/"  # prefix of the name of a listener on another machine (`listeners.remote`)
 
 log = logging.getLogger(__name__)
 
@@ -33,16 +33,16 @@ def plugins(group: str) -> Mapping[str, EntryPoint]:
 
 
 def shipped(group: str, **kinds: str) -> Mapping[str, EntryPoint]:
-    """Return this package's own kinds of a group by name: `some_kind="module:callable"` is some-kind."""
+    """Return this package's own kinds of a group by name: `some_kind="module:callable"` becomes some-kind."""
     named = {name.replace("_", "-"): place for name, place in kinds.items()}
     return {name: EntryPoint(name, f"{group}.{place}", group) for name, place in named.items()}
 
 
 def plug_in(entry: EntryPoint, *arguments: Any, **more: Any) -> Any:
-    """Import what an entry names and return it, or what it returns where there are `arguments`.
+    """Import the object of an entry and return it; with `arguments`, call it and return the result.
 
-    Raises a ConfigError of one line for any error of another package, but RobotErrors that its callable raises on
-    purpose. Errors of this package's own kinds pass unchanged.
+    Raises a ConfigError of one line for any error of another package, except for RobotErrors that its callable raises
+    on purpose. Errors of this package's own kinds are raised unchanged.
     """
     try:
         found = entry.load()
@@ -61,9 +61,9 @@ def plugin_error(entry: EntryPoint, problem: str) -> ConfigError:
 
 
 def listener_folder(name: str) -> Path | None:
-    """Return the folder of a listener by shipped name or path; None for a plug-in, or one on another machine.
+    """Return the folder of a listener by shipped name or path; None for a plug-in or a listener on another machine.
 
-    Raises ConfigError with the choices.
+    Raises ConfigError that lists the choices.
     """
     if name.startswith(REMOTE):
         return None

@@ -1,6 +1,6 @@
 """Interfaces between the parts of a run, each with several implementations.
 
-Parts are put together in `app`; all code that runs in time takes `now_s` as an argument.
+The parts are put together in `app`. All code that depends on time takes `now_s` as an argument.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from sfms_robot.frames import Doubles, Events, Floats, Ints, Plan, Readings, Sig
 
 StopPolicy = Literal["release", "hold"]  # torque off, or torque kept on, once the rest pose is reached
 Facts = Mapping[str, Any]  # figures and states for a report, by name
-Document = Callable[[], Facts]  # those of this moment
-STOP_S: Final = 0.5  # that `Bus.stop` takes at most
+Document = Callable[[], Facts]  # returns the current facts
+STOP_S: Final = 0.5  # longest duration of `Bus.stop`
 
 
 class Sense(Protocol):
-    """A microphone, a camera, or a recording of one. Live ones are filled from another thread or process.
+    """A microphone, a camera, or a recording of one. A live one is filled from another thread or process.
 
     Time stamps are those of `time.monotonic`.
     """
@@ -63,7 +63,7 @@ class Sight(Sense, Protocol):
 
 
 class Outlet(Protocol):
-    """A program beside the run that receives its sound and events. Never blocks, may drop."""
+    """Another program that receives sound and events of the run. Its methods never block and may drop data."""
 
     def hears(self, audio: Floats, time_s: float) -> None:
         """Send the listener's samples (640,); `time_s`: loop time of the newest."""
@@ -77,9 +77,9 @@ class Source(Protocol):
 
     Attributes:
         duration_s: length of a recording; None for something live.
-        latency_s: as of `Voice`.
+        latency_s: see `Voice`.
         outlets: programs that receive sound and events of the run.
-        missing: names of its lost parts; the run is degraded meanwhile.
+        missing: names of its lost parts; the run is degraded while there are any.
     """
 
     duration_s: float | None = None
@@ -99,7 +99,7 @@ class Source(Protocol):
         ...
 
     def moves(self, speed_rad_s: float) -> None:
-        """Take the summed speed of the head's joints, at every tick: the microphone picks up their motors."""
+        """Receive the summed speed of the head's joints at every tick, since the microphone picks up their motors."""
         return None
 
     def statistics(self) -> Facts:
@@ -126,7 +126,7 @@ class Listener(Protocol):
         """Return the memory of a new stream."""
 
     def step(self, speaker: SpeakerFrame, memory: Any) -> tuple[Plan | None, Any]:
-        """Process one frame; return a Plan on every `hop`-th, None between. Never changes `memory` in place."""
+        """Process one frame; return a Plan on every `hop`-th frame, else None. Never changes `memory` in place."""
 
 
 class PlanFeed(Protocol):
@@ -164,8 +164,8 @@ class TickConversion(Protocol):
 class Bus(Protocol):
     """Servos of one or several named buses, addressed by joint.
 
-    The trouble of one servo is never raised: it is a named fault in its `Reading`. Except for `torque_off`, one thread
-    at a time calls a bus.
+    A problem of one servo is never raised; it is a named fault in its `Reading`. Except for `torque_off`, only one
+    thread at a time may call a bus.
     """
 
     @property
@@ -179,9 +179,9 @@ class Bus(Protocol):
     def connect(self) -> None:
         """Open the ports, identify every servo that answers and check it against the head. Torque stays as found.
 
-        Blocks for as long as identifying takes (a silent id a few tenths of a second). A servo that does not answer
-        is left absent, with a fault in its reading, and brought in when it appears. Raises PortError; BusError when no
-        servo answers; ServoError when a servo contradicts the head's file.
+        Blocks while servos are identified (a few tenths of a second for a silent id). A servo that does not answer
+        counts as absent, with a fault in its reading, and is brought in when it appears. Raises PortError; BusError
+        when no servo answers; ServoError when a servo contradicts the head's file.
         """
 
     def enable(self, joints: Sequence[str]) -> Doubles:
@@ -190,51 +190,51 @@ class Bus(Protocol):
         The angles are in the order of `joints`; that of an absent joint is 0 rad, or the end of its range nearest to
         0. Its goals are withheld until it has been brought in, which its reading reports as `rejoined`.
 
-        Blocks per joint for a few exchanges and the stagger time. Raises ServoError for a servo that refuses, BusError
-        when the supply or the port fails meanwhile; call `stop` then.
+        Blocks for a few exchanges and the stagger time per joint. Raises ServoError for a servo that refuses, BusError
+        when the supply or the port fails meanwhile; call `stop` after such an error.
         """
 
     def write(self, goals_rad: Doubles, now_s: float) -> None:
         """Send one goal per joint, rad (J,), in one packet; those of joints without torque are withheld.
 
-        Never waits for an answer. Raises ValueError, with nothing sent, before `enable`, and for a shape, a value that
-        is not finite, or a goal to be sent that is not in the range in force.
+        Never waits for an answer. Raises ValueError, with nothing sent, before `enable`, and for a wrong shape, a value
+        that is not finite, or a goal to be sent that is not in the range in force.
         """
 
     def poll(self, now_s: float) -> Readings:
         """Return the freshest reading of every joint, and recover servos in trouble.
 
-        Blocks within the bus's time budget, also after losses on the wire: silence of any number of servos costs one
-        read deadline. Requests that do not fit are left to later polls. Raises BusError when the bus has failed: no
+        Blocks no longer than the bus's time budget, also after losses on the wire: any number of silent servos costs
+        one read deadline. Requests that do not fit are left to later polls. Raises BusError when the bus has failed: no
         answer for `reconnect_s`.
         """
 
     def torque_off(self, policy: StopPolicy) -> None:
-        """Send torque-off now, unconfirmed: one packet per wire, to this head's ids alone; pulses off on boards.
+        """Send torque-off now, unconfirmed: one packet per wire, only to this head's ids; boards switch pulses off.
 
-        May be called from any thread at any time after `connect`, also while another one is inside `poll`. Never
+        May be called from any thread at any time after `connect`, also while another thread is inside `poll`. Never
         raises, never waits for an answer. No goal is sent from then on, until `enable` or `resume`. With the policy
         "hold" nothing happens.
         """
 
     def release(self, joints: Sequence[str]) -> None:
-        """Switch torque off for `joints` alone: their goals are withheld until `resume` or `enable`.
+        """Switch torque off for `joints` only: their goals are withheld until `resume` or `enable`.
 
-        Written at once in one packet per wire, and again in every poll until each servo reports that it is off. Never
-        waits for an answer; raises nothing. Called in the thread of `write`.
+        The command is written at once in one packet per wire, and again in every poll until each servo reports that its
+        torque is off. Never waits for an answer; raises nothing. Called in the thread of `write`.
         """
 
     def resume(self, joints: Sequence[str]) -> None:
         """Bring back those of `joints` that have no torque, after `release`, `torque_off` or a fault.
 
-        Only requested here: the polls do it, a few joints in each, as with a servo that was away; its reading reports
-        `rejoined`. Never waits; raises nothing. Called in the thread of `write`.
+        This only requests it: later polls bring back a few joints each, as with a servo that was lost, and their
+        readings report `rejoined`. Never waits; raises nothing. Called in the thread of `write`.
         """
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """Switch torque off on all buses first, then confirm and repeat, as far as servos answer.
 
-        Joints whose safety or `policy` is hold keep theirs. Goals are refused from now on. Never raises; takes
+        Joints keep their torque if `policy` or their safety is hold. Goals are refused from now on. Never raises; takes
         `within_s` at most, also with dead servos; idempotent. Joints whose torque came on and could
         not be confirmed off are listed in `statistics` from then on.
         """
@@ -245,12 +245,12 @@ class Bus(Protocol):
     def statistics(self) -> Facts:
         """Return counters for the report: writes, reads, errors, retries, reconnects, silent ids, faults.
 
-        And `torque_unconfirmed`: joints whose torque was not confirmed off by the last `torque_off` or `stop`.
+        They include `torque_unconfirmed`: joints whose torque the last `torque_off` or `stop` did not confirm off.
         """
 
 
 class Observer(Protocol):
-    """An observer of the loop, which may drop but never blocks. A subclass overrides the methods that it needs."""
+    """An observer of the loop, which may drop data but never blocks. A subclass overrides the methods that it needs."""
 
     def tick(self, seen: Tick) -> None:
         return
@@ -267,18 +267,18 @@ class Observer(Protocol):
 
 @dataclass(frozen=True)
 class Tick:
-    """One turn of the loop, as observers see it.
+    """One turn of the loop, as observers receive it.
 
     Attributes:
         time_s: nominal time of the tick.
         motion: (58,) the requested face at this instant, without lead.
         goals_rad: (J,) goals written to the bus.
         readings: freshest reading per joint.
-        state, why: of the run, see docs/safety.md; `why` names lost parts, or the causes of a halt.
-        written_s: loop time at which the goals were on the wire; None where it was not measured.
-        origin_s: loop time 0 in seconds of `time.monotonic`, in virtual time of the virtual clock; None on the way to
-            rest.
-        busy: this computer is late, and by how much, in words; None: it is not.
+        state, why: state of the run, see docs/safety.md; `why` names lost parts, or the causes of a halt.
+        written_s: loop time at which the goals were on the wire; None if it was not measured.
+        origin_s: loop time 0 in seconds of `time.monotonic`, or of the virtual clock in virtual time; None on the way
+            to rest.
+        busy: a text if this computer is late, which says by how much; None if it is not.
     """
 
     time_s: float
@@ -307,9 +307,9 @@ class OutputFrame:
 
     Attributes:
         time_s: loop time.
-        motion: (58,) pose and blendshapes, eased and limited already.
-        state: of the run, see docs/safety.md.
-        events: those that have begun since the frame before.
+        motion: (58,) pose and blendshapes, already eased and limited.
+        state: state of the run, see docs/safety.md.
+        events: events that have begun since the previous frame.
         goals_rad, joints: (J,) goals of the servos and their names; empty with `--head none`.
     """
 
@@ -322,17 +322,17 @@ class OutputFrame:
 
 
 class Output(Protocol):
-    """A head that takes a face or a pose: an avatar, a robot with a daemon. One thread calls it.
+    """A head that accepts a face or a pose: an avatar, or a robot with a daemon. It is called from one thread.
 
-    A subclass has to define what has no value here. Constructing one connects to nothing.
+    A subclass must define everything that has no value here. The constructor does not connect.
 
     Attributes:
-        kind: of `--output`. peer: the address, or what else tells two outputs of one kind apart.
-        rate_hz: of `send`.
-        moves: a machine moves: it holds its pose in a halt. An avatar goes neutral.
-        limits: by channel of motion; the others pass unchanged.
-        look_at: set by the run; turns head and eyes to x, y, z [m] where the peer asks for that, from any thread.
-            Raises InputError.
+        kind: KIND of `--output`. peer: the address, or another text that distinguishes two outputs of one kind.
+        rate_hz: rate of `send`.
+        moves: True for a machine, which holds its pose in a halt; an avatar goes neutral.
+        limits: limits by channel of motion; the other channels pass unchanged.
+        look_at: set by the run; turns head and eyes to x, y, z [m] if the peer requests it. May be called from any
+            thread. Raises InputError.
     """
 
     kind: str
@@ -343,18 +343,18 @@ class Output(Protocol):
     look_at: Callable[[float, float, float], object] | None = None
 
     def open(self) -> None:
-        """Connect, and lead the peer to neutral: pose 0, blendshapes 0. Called again after a loss.
+        """Connect, and move the peer to neutral: pose 0, blendshapes 0. Called again after a loss.
 
-        May block up to 2 s. Raises OutputError in one line, or OSError.
+        May block up to 2 s. Raises OutputError of one line, or OSError.
         """
         ...
 
     def send(self, frame: OutputFrame, now_s: float) -> None:
-        """Send a frame; `now_s`: of `time.monotonic`. Raises OutputError, OSError when the peer is lost."""
+        """Send a frame; `now_s`: time of `time.monotonic`. Raises OutputError or OSError when the peer is lost."""
         ...
 
     def statistics(self) -> Facts:
-        """Return figures for the report. From any thread."""
+        """Return figures for the report. May be called from any thread."""
         return {}
 
     def close(self) -> None:
@@ -367,7 +367,7 @@ class Clock(Protocol):
 
     @property
     def origin_s(self) -> float:
-        """Its 0 in seconds of `time.monotonic`; 0 in virtual time."""
+        """Time 0 of this clock in seconds of `time.monotonic`; 0 in virtual time."""
 
     def now_s(self) -> float: ...
 
@@ -375,7 +375,7 @@ class Clock(Protocol):
 
 
 class Timeline(Protocol):
-    """Joined plans, played at any instant. State is a value."""
+    """Plans joined into one motion, which can be sampled at any instant. State is a value."""
 
     def start(self) -> Any: ...
 
@@ -385,7 +385,7 @@ class Timeline(Protocol):
         """Return motion (N, 58) at (N,) instants, and the state with its counters."""
 
     def lead_limit_s(self, state: Any) -> float:
-        """Return the longest time after a tick [s] that `sample` can give; inf if the whole future is known."""
+        """Return the longest time after a tick [s] that `sample` can look ahead; inf if the whole future is known."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -396,7 +396,7 @@ class Watched:
         seen_s: loop time of the last sighting; None: never.
         place_m, attention: of that sighting, see `Sighting`.
         said_s: loop time of the last sound of the robot itself; -inf: never.
-        by_hand: a program turns head or eyes at this tick.
+        by_hand: True if a program turns head or eyes at this tick.
     """
 
     seen_s: float | None = None
@@ -417,7 +417,7 @@ class Retargeter(Protocol):
     def step(self, motion: Floats, state: Any, knobs: Any = None) -> tuple[Doubles, Any]:
         """Return angles (J,) [rad] of motion (J, 58), one row per joint and its lead, or (58,) for all.
 
-        `knobs` None: those of the head's file.
+        `knobs` None: the knobs of the head's file.
         """
 
     def shown_pose(self, motion: Floats, knobs: Any = None) -> Doubles:

@@ -1,21 +1,21 @@
-"""Child processes: started, supervised, connected by two pipes; pools of them; and real-time priority.
+"""Child processes: started, supervised, connected by two pipes; process pools; and real-time priority.
 
 A child is a new interpreter, not a copy of this program, so a script, a notebook and a thread may all start one. It has
 its own session: only the parent receives Ctrl-C from a terminal, since the head must reach rest first. It ends when its
-pipe does, so it never outlives its parent. It computes with one thread unless it sets another number: with as many
-threads as cores in each of several processes, the threads of one spin in wait while another has their core (OpenMP).
+pipe is closed, so it never outlives its parent. It computes with one thread unless it sets another number: if each of
+several processes had as many threads as cores, waiting threads would spin on cores that others need (OpenMP).
 
     parent                                   child
     Child(call, first messages)              ParentPipe()
     send     in order, each arrives     ->   receive, forward
-    offer    the newest wait            ->
-    receive, or a callback              <-   send; None is a sign of life and nothing more
+    offer    only the newest are kept   ->
+    receive, or a callback              <-   send; None is only a sign of life
 
 Messages are pickled. `Supervised` starts a child again by one of the `LIMITS`:
 
     phase          begins                                  ends
     starting       the process was started                 its first message
-    loading        a listener has its weights              it is ready to listen
+    loading        a listener has loaded its weights       it is ready to listen
     running                                                it dies, raises, or gives no sign of life for `silent_s`
     backing off    it failed, and was killed               after a pause: starting
     given up       more than `restarts` in a minute        never
@@ -46,10 +46,10 @@ from typing import IO, Any, Final, NamedTuple
 
 # Read by OpenMP (torch), OpenBLAS (numpy, scipy) and MKL when they are loaded; onnxruntime sets its own per session.
 ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-START_LIMIT_S: Final = 60.0  # importing torch on a small board with a cold disk
+START_LIMIT_S: Final = 60.0  # enough to import torch on a small board with a cold disk
 _MINUTE_S: Final = 60.0
-_FULL_S: Final = 0.5  # between two checks of whether a full pipe is to be closed
-_NON_BLOCKING: Final = os.name == "posix"  # elsewhere a pipe cannot be asked not to block
+_FULL_S: Final = 0.5  # longest wait for room in a full pipe before the next attempt to write
+_NON_BLOCKING: Final = os.name == "posix"  # on other systems a pipe always blocks
 
 log = logging.getLogger(__name__)
 
@@ -64,19 +64,19 @@ class Ended(NamedTuple):
 
 
 class Child:
-    """A child process. Nothing blocks except `close`, and `receive` with a limit.
+    """A child process. No method blocks except `close`, and `receive` with a limit.
 
     Args:
-        call: "module:function", called without arguments; it begins with `ParentPipe()`.
+        call: "module:function", called without arguments; the function begins with `ParentPipe()`.
         first: messages that are sent at once.
-        name: of the threads that serve its pipes.
-        take: called with each message, in the thread that reads; without it, messages wait for `receive`.
-        kept: number of offered messages that wait for a full pipe.
-        most: number of messages that wait for `receive`; the oldest are dropped, and counted. 0: all wait.
-        quiet: discard what it writes to stderr.
+        name: name of the threads that serve its pipes.
+        take: called with each message, in the reading thread; without it, messages wait for `receive`.
+        kept: number of offered messages that wait while the pipe is full.
+        most: number of messages that wait for `receive`; older ones are dropped and counted. 0: all wait.
+        quiet: discard the child's stderr.
 
     Attributes:
-        dropped: messages that `receive` did not get.
+        dropped: number of messages that were dropped before `receive`.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Child:
         self._writer.send(pickle.dumps(message, protocol=5))
 
     def offer(self, message: Any) -> int:
-        """Send a message, unless `kept` newer ones come before the pipe has room. Return how many it pushed out."""
+        """Send a message, unless `kept` newer ones come before the pipe has room. Return how many it displaced."""
         return self._writer.offer(pickle.dumps(message, protocol=5))
 
     def receive(self, limit_s: float = 0.0) -> Any:
@@ -124,7 +124,7 @@ class Child:
             return None
 
     def gave_sign(self) -> bool:
-        """Return whether anything has come since the last call."""
+        """Return whether any message has come since the last call."""
         alive, self._alive = self._alive, False
         return alive
 
@@ -141,7 +141,7 @@ class Child:
         self._writer.close()
 
     def close(self, limit_s: float) -> None:
-        """Close the pipe behind what waits, wait for the end, and kill a process that is there after `limit_s`.
+        """Close the pipe after all waiting messages, wait for the process to end, and kill it after `limit_s`.
 
         Blocks for twice `limit_s` at most. Idempotent.
         """
@@ -150,7 +150,7 @@ class Child:
             self.process.wait(limit_s)
         except subprocess.TimeoutExpired:
             self.process.kill()
-            with suppress(subprocess.TimeoutExpired):  # held by a driver: left to the system
+            with suppress(subprocess.TimeoutExpired):  # blocked in a driver: left to the system
                 self.process.wait(limit_s)
 
     def _read(self, pipe: IO[bytes]) -> None:
@@ -169,7 +169,7 @@ class Child:
 
 
 def _messages(pipe: IO[bytes]) -> Iterator[Any]:
-    """Yield what the other end pickles into a pipe, until that end is gone; one that was cut short is left out."""
+    """Yield the objects that the other end pickles into a pipe, until it is closed. An incomplete one is left out."""
     with suppress(EOFError, OSError, pickle.UnpicklingError):
         while True:
             yield pickle.load(pipe)
@@ -178,12 +178,12 @@ def _messages(pipe: IO[bytes]) -> Iterator[Any]:
 class PipeWriter:
     """The writing end of a pipe, for threads that must not wait. All methods may be called from any thread.
 
-    A message is written by the thread that hands it over where the pipe has room: some microseconds, without a switch
-    to another thread. Of several threads one writes, and finds what the others have added; none waits for another. When
-    the pipe is full, another thread waits until it has room. Messages to a process that has ended are dropped.
+    While the pipe has room, the calling thread writes its message itself: some microseconds, without a switch to
+    another thread. If several threads call at once, one writes the messages of all; none waits for another. When the
+    pipe is full, a separate thread waits until it has room. Messages to a process that has ended are dropped.
 
     Args:
-        pipe: closed when all that was sent is written, after `close`.
+        pipe: is closed after `close`, once all sent messages are written.
         kept: number of offered messages that wait.
     """
 
@@ -191,9 +191,9 @@ class PipeWriter:
         self._pipe = pipe
         self._sent = deque[bytes]()
         self._offered = deque[bytes](maxlen=kept)
-        self._rest = memoryview(b"")  # of a message of which the pipe has taken the beginning
+        self._rest = memoryview(b"")  # the part of a message that the pipe has not accepted yet
         self._writing = threading.Lock()
-        self._full = False  # set by the thread that writes, cleared by the one that waits for room
+        self._full = False  # set by the thread that writes, cleared by the thread that waits for room
         self._wake = threading.Event()
         self._closing = False
         if _NON_BLOCKING:
@@ -213,7 +213,7 @@ class PipeWriter:
         return int(dropped)
 
     def close(self) -> None:
-        """Close the pipe when all is written that waits now."""
+        """Close the pipe once all waiting messages are written."""
         self._closing = True
         self._advance()
 
@@ -224,7 +224,7 @@ class PipeWriter:
             self._wake.set()
 
     def _write_all(self) -> None:
-        """Write until nothing waits or the pipe is full. The check follows the release: no message is overlooked."""
+        """Write until nothing waits or the pipe is full; check again after the release, so no message is overlooked."""
         while not self._full and self._has_work() and self._writing.acquire(blocking=False):
             try:
                 self._write_one()
@@ -243,7 +243,7 @@ class PipeWriter:
                 self._rest = self._rest[os.write(self._pipe.fileno(), self._rest) :]
         except BlockingIOError:
             self._full = True
-        except (OSError, ValueError):  # the reader has ended, which the thread that reads its answers reports
+        except (OSError, ValueError):  # the other process has ended, which our reading thread reports
             self._rest = memoryview(b"")
         if self._closing and not (self._rest or self._sent or self._offered):
             self._pipe.close()
@@ -254,7 +254,7 @@ class PipeWriter:
             self._wake.wait()
             self._wake.clear()
             while self._full:
-                (room := select.poll()).register(self._pipe, select.POLLOUT)  # a descriptor of any number
+                (room := select.poll()).register(self._pipe, select.POLLOUT)  # accepts a descriptor of any number
                 room.poll(1e3 * _FULL_S)
                 self._full = False
                 self._write_all()
@@ -267,16 +267,16 @@ class PipeWriter:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """When a child counts as hung, and when it is started again. Times in seconds; inf: never.
+    """Limits after which a child counts as hung, is restarted or is given up. Times in seconds; inf: never.
 
     Attributes:
-        hung_s: without a sign of life; reported once, and once when it is over.
-        silent_s: without a sign of life, by phase; then it is killed.
-        phase_s: since the phase began, by phase; then it is killed, whatever signs of life it gives.
-        pause_s: from a failure to the restart; doubled by each further failure, up to `longest_pause_s`.
-        steady_s: running for so long resets the pause.
-        restarts: in a minute; after one failure more it is given up.
-        step_s: most that one check adds to the times: a longer break between checks was the parent's own.
+        hung_s: time without a sign of life after which it counts as hung; its begin and its end are logged once.
+        silent_s: time without a sign of life, by phase, after which it is killed.
+        phase_s: time since the phase began, by phase, after which it is killed, even if it gives signs of life.
+        pause_s: pause from a failure to the restart; doubled by each further failure, up to `longest_pause_s`.
+        steady_s: time of running that resets the pause.
+        restarts: most restarts in a minute; after one more failure it is given up.
+        step_s: most that one check adds to the times: a longer break between checks was a break of the parent.
     """
 
     hung_s: float = math.inf
@@ -303,19 +303,19 @@ LIMITS: Final[Mapping[str, Limits]] = {
 
 
 class Supervised:
-    """A child that is started again when it fails. It reads no clock: times are those of `check`.
+    """A child that is started again when it fails. It reads no clock; `check` passes the time.
 
     Args:
-        name: for the log.
+        name: name for the log.
         limits: one of `LIMITS`.
         start: starts a child; may raise OSError, which counts as another failure.
 
     Attributes:
-        child: the newest.
-        phase: see the module.
+        child: the newest child.
+        phase: see the module's docstring.
         phase_s: time in this phase; set it to 0 while the child waits for its parent.
-        hung: no sign of life for `Limits.hung_s`.
-        hangs, restarts: how often so far.
+        hung: True if there was no sign of life for `Limits.hung_s`.
+        hangs, restarts: counts so far.
     """
 
     def __init__(self, name: str, limits: Limits, start: Callable[[], Child]) -> None:
@@ -327,12 +327,12 @@ class Supervised:
         self._checked_s: float | None = None
         self._time_s = self._silent_s = self._restart_at_s = 0.0
         self._pause_s = limits.pause_s
-        self._failed = False  # and has not been steady since
+        self._failed = False  # True after a failure, until the child has run steadily
         self._restarted_s = deque[float]()
 
     @property
     def away(self) -> bool:
-        """Return whether it is hung, failed, or restarted and not yet running."""
+        """Return whether the child is hung, failed, or restarted and not yet running."""
         failed = self.phase in ("backing off", "given up")
         return self.hung or failed or (self.restarts > 0 and self.phase != "running")
 
@@ -343,12 +343,12 @@ class Supervised:
         self.phase, self.phase_s, self._silent_s = phase, 0.0, 0.0
 
     def check(self, now_s: float, alive: bool, failure: str | None = None) -> None:
-        """Judge the child; kill and restart it where its limits say so. Never blocks.
+        """Compare the child with its limits; kill and restart it as they require. Never blocks.
 
         Args:
-            now_s: of any clock; what counts are the steps from one check to the next, and a step back counts as 0.
-            alive: it has given a sign of life since the last check, or nothing is expected of it.
-            failure: it has died, or says that it cannot continue.
+            now_s: time of any clock; only the steps from one check to the next count, and a step back counts as 0.
+            alive: the child has given a sign of life since the last check, or none is expected.
+            failure: reason, if it has died or reports that it cannot continue; else None.
         """
         limits = self._limits
         passed_s = 0.0 if self._checked_s is None else now_s - self._checked_s
@@ -371,13 +371,13 @@ class Supervised:
             self.restarts += 1
             try:
                 self.child = self._start()
-            except OSError as error:  # no more processes, no more memory
+            except OSError as error:  # the system has no process or memory left
                 self.fail(str(error))
             else:
                 self.enter("starting")
 
     def fail(self, why: str) -> None:
-        """Kill the child; the check after the pause starts another, unless there were too many."""
+        """Kill the child; the check after the pause starts another, unless there were too many restarts."""
         self.child.kill()
         self.hung = False
         while self._restarted_s and self._time_s - self._restarted_s[0] >= _MINUTE_S:
@@ -407,9 +407,9 @@ class Supervised:
 
 
 class ParentPipe:
-    """In a child: the two pipes to its parent. What a library prints goes to stderr from now on.
+    """The two pipes from a child to its parent. From now on, what a library prints goes to stderr.
 
-    SIGINT is ignored: a child ends when its pipe does.
+    SIGINT is ignored: a child ends when its pipe is closed.
     """
 
     def __init__(self) -> None:
@@ -418,13 +418,13 @@ class ParentPipe:
         os.dup2(2, 1)
 
     def receive(self) -> Any:
-        """Return the next message. Blocks; a parent that has ended ends this process without a word."""
+        """Return the next message. Blocks. If the parent has ended, this process exits silently."""
         for message in _messages(self.incoming):
             return message
         raise SystemExit(0)
 
     def forward(self, take: Callable[[Any], object], end: Callable[[], object] = lambda: os._exit(0)) -> None:
-        """Pass all further messages to `take`, in a thread; then call `end`, which ends this process at once."""
+        """Pass all further messages to `take`, in a thread; then call `end`, which by default exits at once."""
 
         def read() -> None:
             for message in _messages(self.incoming):
@@ -447,7 +447,7 @@ def start_thread(work: Callable[..., object], name: str, *arguments: Any) -> thr
 
 
 def give_way(nice: int) -> None:
-    """Let processes of higher priority go first; `nice`: by how much, 0 to 19, where the system has that."""
+    """Lower the priority of this process by `nice`, 0 to 19, if the system supports it."""
     if hasattr(os, "nice"):
         os.nice(nice)
 
@@ -455,9 +455,9 @@ def give_way(nice: int) -> None:
 @contextmanager
 def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
     """Start a pool whose processes compute with one thread each. On leaving, tasks that have not begun are dropped."""
-    from sfms_robot.signals.audio import environment  # numpy with it, which few children need
+    from sfms_robot.signals.audio import environment  # imports numpy, which few children need
 
-    with environment(ONE_THREAD), ExitStack() as stack:  # a pool starts its processes as tasks come, with that of then
+    with environment(ONE_THREAD), ExitStack() as stack:  # processes are started on demand, with the current environment
         pool = ProcessPoolExecutor(processes, get_context("spawn"))  # torch's threads do not survive a fork
         stack.callback(pool.shutdown, cancel_futures=True)
         yield pool
@@ -470,14 +470,14 @@ def cores() -> int:
 
 # --- Real-time priority -----------------------------------------------------------------------------------------------
 
-SWITCH_S: Final = 0.0001  # a tick waits so long for another thread; Python's own 5 ms is half a tick
+SWITCH_S: Final = 0.0001  # longest wait of a tick for another thread; Python's default, 5 ms, is half a tick
 
 
 @contextmanager
 def realtime_priority(wanted: bool = True) -> Iterator[str]:
-    """Run with SCHED_FIFO, where the system grants it. Yield "fifo", "not asked for", or why it was refused.
+    """Run with SCHED_FIFO if the system grants it. Yield "fifo", "not asked for", or the reason of the refusal.
 
-    Other threads of this process (a recorder, a progress bar) also hand the interpreter back after `SWITCH_S`.
+    Other threads of this process (a recorder, a progress bar) also release the interpreter after `SWITCH_S`.
     """
     if not wanted:
         yield "not asked for"
@@ -486,7 +486,7 @@ def realtime_priority(wanted: bool = True) -> Iterator[str]:
     sys.setswitchinterval(SWITCH_S)
     try:
         before = (os.sched_getscheduler(0) | os.SCHED_RESET_ON_FORK, os.sched_getparam(0))
-        # A process that is started meanwhile, such as a listener that died, must not compete with the loop.
+        # A process that is started meanwhile, such as a restarted listener, must not compete with the loop.
         policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO)))
         outcome = "fifo"

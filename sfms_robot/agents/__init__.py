@@ -1,10 +1,10 @@
-"""Adapters for voice agents: a head hears what the person and the agent say, the agent receives what the head decides.
+"""Adapters for voice agents: a head receives the sound of person and agent, the agent receives the head's events.
 
     pipecat           a processor and an observer         livekit   taps of a session's sound
     openai_realtime   a conversation over a WebSocket     mcp       a running head as tools of an assistant
 
-The first three take a `sfms_robot.Robot` of this process, `mcp` the address of a run's page. Of this package they use
-what any program may: the public API.
+The first three need a `sfms_robot.Robot` of this process, `mcp` the address of a run's page. They use only the public
+API of this package, as any program may.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-KINDS: Final = ("nod", "mm_hm", "smile")  # what an agent can use; a head also blinks, tilts, looks away, ...
+KINDS: Final = ("nod", "mm_hm", "smile")  # events that an agent can use; a head also blinks, tilts, looks away, ...
 _PCM16: Final = np.dtype("<i2")
-_PROBLEMS: Final = 5  # named of each direction; all are counted
+_PROBLEMS: Final = 5  # different problems logged for each direction; all are counted
 
 
 class HeadLink:
-    """A robot as an agent's event loop uses it. Sound that cannot be used is left out and named; the agent continues.
+    """Link of an agent's event loop to a robot. Unusable sound is left out and logged; the agent continues.
 
     Args:
         robot: a robot that is running, or will be.
@@ -48,15 +48,15 @@ class HeadLink:
         self.refused = Counter[str]()
 
     def hear(self, pcm: bytes, rate_hz: float, channels: int = 1) -> None:
-        """Hand over what the person says now, 16-bit little-endian, channels interleaved. Never blocks or raises."""
+        """Send the robot the person's present sound, 16-bit little-endian, interleaved. Never blocks or raises."""
         self._hand_over("voice", lambda: self._robot.hear(_mono(pcm, channels), rate_hz))
 
     def say(self, pcm: bytes, rate_hz: float, channels: int = 1) -> None:
-        """Hand over what the agent says next, as `hear`."""
+        """Send the robot the agent's next speech, as `hear` does."""
         self._hand_over("speech", lambda: self._robot.say(_mono(pcm, channels), rate_hz))
 
     def hush(self) -> None:
-        """Drop the speech that still waits."""
+        """Drop the speech that was not played yet."""
         self._hand_over("speech", self._robot.hush)
 
     def on(self, kinds: Sequence[str], take: Callable[[ListenerEvent], object]) -> None:
@@ -79,15 +79,15 @@ class HeadLink:
             self._robot.on(kind, decided)
 
     def open(self) -> None:
-        """Hand over events from now on, in the running event loop."""
+        """Pass events on from now on, in the running event loop."""
         self._loop = asyncio.get_running_loop()
 
     def close(self) -> None:
-        """Hand over no further events."""
+        """Stop passing events on."""
         self._loop = None
 
     def problem(self, what: str, problem: object) -> None:
-        """Count something that was left out, and name it in the log unless it was named before."""
+        """Count a piece that was left out, and log the problem unless it was logged before."""
         self.refused[what] += 1
         found = (what, str(problem))
         if found not in self._named and sum(each == what for each, _ in self._named) < _PROBLEMS:
@@ -97,14 +97,14 @@ class HeadLink:
     def _hand_over(self, what: str, hand_over: Callable[[], None]) -> None:
         try:
             hand_over()
-        except RobotError as error:  # of bad sound, or of a robot that does not listen to programs
+        except RobotError as error:  # bad sound, or a robot that accepts no sound of programs
             self.problem(what, error)
 
 
 async def events(robot: Robot, *kinds: str) -> AsyncIterator[ListenerEvent]:
     """Yield the events of a robot, in an event loop: `async for event in events(robot, "nod", "mm_hm")`.
 
-    Without `kinds` those of `KINDS`. Raises InputError for an unknown kind.
+    Without `kinds`, yields those of `KINDS`. Raises InputError for an unknown kind.
     """
     link, waiting = HeadLink(robot, "events"), asyncio.Queue[ListenerEvent]()
     link.on(kinds or KINDS, waiting.put_nowait)
@@ -117,7 +117,7 @@ async def events(robot: Robot, *kinds: str) -> AsyncIterator[ListenerEvent]:
 
 
 def _mono(pcm: bytes, channels: int) -> bytes:
-    """Return the mean of interleaved channels. Raises ConfigError where the bytes are not whole samples of each."""
+    """Return the mean of interleaved channels. Raises ConfigError if the bytes are not whole samples of each."""
     if channels == 1:
         return pcm
     if not isinstance(channels, int) or channels < 1:

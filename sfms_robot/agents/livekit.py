@@ -1,10 +1,10 @@
-"""A head beside a LiveKit agent (livekit-agents): taps of the sound of a session.
+"""A head for a LiveKit agent (livekit-agents): taps of the sound of a session.
 
     await session.start(agent, room=room)
     attach(session, robot)
 
-The agent hears and speaks as before; a copy goes to the robot. `hear_track` is for a participant outside a session.
-What the head decides comes from `agents.events`.
+The agent hears and speaks as before; a copy of the sound goes to the robot. `hear_track` is for a participant outside a
+session. `agents.events` yields the events that the head decides.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class PersonTap(AudioInput):
-    """Sound input of a session that hands a robot what it passes on.
+    """Sound input of a session that sends a copy of its sound to a robot.
 
     Args:
         robot: a robot that is running.
@@ -46,10 +46,10 @@ class PersonTap(AudioInput):
 
 
 class AgentTap(AudioOutput):
-    """Sound output of a session that hands a robot what it passes on to the next output.
+    """Sound output of a session that sends a robot a copy of the sound for the next output.
 
-    A pause keeps what was not played yet, and says it when the session resumes: a session pauses while it finds out
-    whether the person interrupts.
+    In a pause, speech that was not played yet is kept, and is spoken when the session resumes. A session pauses while
+    it finds out whether the person interrupts.
 
     Args:
         robot: a robot that is running.
@@ -66,12 +66,12 @@ class AgentTap(AudioOutput):
         )
         self.robot_link = HeadLink(robot, "livekit")
         self._now = now
-        self._waiting: list[rtc.AudioFrame] = []  # of `_given_s`, played from `_since_s` on
+        self._waiting: list[rtc.AudioFrame] = []  # `_given_s` long, played from `_since_s` on
         self._given_s = self._since_s = 0.0
         self._paused = False
 
     async def capture_frame(self, frame: rtc.AudioFrame) -> None:
-        """Hand over a frame of speech, and pass it on."""
+        """Send a frame of speech to the robot, and pass it on."""
         await super().capture_frame(frame)
         if self._unplayed_s() <= 0.0:
             self._waiting, self._given_s, self._since_s = [], 0.0, self._now()
@@ -89,23 +89,23 @@ class AgentTap(AudioOutput):
             self.next_in_chain.flush()
 
     def clear_buffer(self) -> None:
-        """Drop the speech that waits: the person has interrupted."""
+        """Drop the speech that was not played yet, because the person has interrupted."""
         self._waiting, self._given_s = [], 0.0
         self.robot_link.hush()
         if self.next_in_chain is not None:
             self.next_in_chain.clear_buffer()
 
     def pause(self) -> None:
-        """Stop the speech, and keep what was not played."""
+        """Stop the speech, and keep the part that was not played."""
         if not self._paused:
             played_s, self._paused = self._given_s - self._unplayed_s(), True
             while self._waiting and (played_s := played_s - self._waiting[0].duration) >= 0.0:
-                self._given_s -= self._waiting.pop(0).duration  # one that was played in part is said again
+                self._given_s -= self._waiting.pop(0).duration  # a frame played in part is spoken again
             self.robot_link.hush()
         super().pause()
 
     def resume(self) -> None:
-        """Say what was kept."""
+        """Speak the part that was kept."""
         if self._paused:
             self._paused, self._since_s = False, self._now()
             for frame in self._waiting:
@@ -113,7 +113,7 @@ class AgentTap(AudioOutput):
         super().resume()
 
     def _unplayed_s(self) -> float:
-        """Return how much of the speech that waits was not played, at the pace of the clock."""
+        """Return how much of the waiting speech was not played [s], if it is played in real time."""
         return self._given_s if self._paused else self._given_s - (self._now() - self._since_s)
 
     def _say(self, frame: rtc.AudioFrame) -> None:
@@ -133,8 +133,8 @@ def attach(session: AgentSession[Any], robot: Robot) -> None:
 
 
 async def hear_track(robot: Robot, frames: AsyncIterable[Any]) -> None:
-    """Hand a robot the sound of `rtc.AudioStream(track)` until the track ends: the person, without a session."""
+    """Send a robot the person's sound from `rtc.AudioStream(track)` until the track ends, without a session."""
     link = HeadLink(robot, "livekit")
     async for each in frames:
-        frame: rtc.AudioFrame = getattr(each, "frame", each)  # of an AudioFrameEvent
+        frame: rtc.AudioFrame = getattr(each, "frame", each)  # it may be an AudioFrameEvent
         link.hear(bytes(frame.data), frame.sample_rate, frame.num_channels)

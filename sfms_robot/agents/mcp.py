@@ -1,8 +1,8 @@
 """A running head as tools of an assistant, over the Model Context Protocol: `sfms-robot mcp`.
 
 Each tool connects to the page of a run (`run --view`), sends one command of its protocol (docs/reference/protocol.md),
-and answers once the run has taken it: the pictures behind it have arrived, or its error. An assistant may halt the head
-and cannot resume it: that is for a person who sees it.
+and answers once the pictures after it have arrived, which shows that the run has accepted it, or with the error of the
+run. An assistant may halt the head, but cannot resume it: only a person who sees the head may.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ with optional("sfms-robot mcp"):
     from mcp.server.mcpserver.exceptions import ToolError
 
 LIMIT_S: Final = 5.0  # to connect, and for an answer
-PICTURES: Final = 5  # 0.2 s: an error of the run comes before them
-MOST_PICTURES: Final = 50  # to wait for a state
+PICTURES: Final = 5  # pictures to wait for, 0.2 s: an error of the run arrives before them
+MOST_PICTURES: Final = 50  # pictures to wait for a state, at most
 _LONGEST_MESSAGE: Final = 2**24
 _INSTRUCTIONS: Final = """Tools that move the face of a robot head which listens to a person by itself.
 What a tool shows replaces its listening for some seconds. Motion keeps the head's limits. Call halt when anything
@@ -42,7 +42,7 @@ class HeadPage:
         url: ws://HOST:PORT, as `run --view` prints it.
         token: printed by a run whose page is bound beyond loopback.
 
-    Raises ConfigError for an address that cannot be one.
+    Raises ConfigError for an invalid address.
     """
 
     def __init__(self, url: str, token: str = "") -> None:
@@ -57,7 +57,7 @@ class HeadPage:
         self._url, self._token = f"{schemes[parts.scheme]}://{parts.netloc}/ws", token
 
     async def status(self) -> dict[str, Any]:
-        """Return what the head is, what it can show, and how the run is going. Raises RobotError."""
+        """Return names, channels and expressions of the head, and the status of the run. Raises RobotError."""
         async with self._connected() as (socket, hello):
             known = {key: hello.get(key) for key in ("head", "listener", "over")}
             known["channels"], known["expressions"] = hello.get("channels"), sorted(hello.get("expressions") or {})
@@ -66,9 +66,9 @@ class HeadPage:
             return known
 
     async def command(self, name: str, /, until: str | None = None, **values: Any) -> str:
-        """Send a command, and return the state of the head once it has been taken.
+        """Send a command, and return the state of the head once the run has accepted it.
 
-        `until`: wait for this state, 2 s at most. Raises RobotError with the run's own line where it refuses.
+        `until`: wait for this state, 2 s at most. Raises RobotError with the run's own line if it refuses.
         """
         async with self._connected(allowed=True) as (socket, hello):
             if hello.get("over"):
@@ -83,7 +83,7 @@ class HeadPage:
 
     @asynccontextmanager
     async def _connected(self, allowed: bool = False) -> AsyncIterator[tuple[ClientConnection, Mapping[str, Any]]]:
-        """Yield a connection and the page's hello; `allowed`: to do more than look.
+        """Yield a connection and the page's hello; `allowed`: with the right to do more than watch.
 
         Raises PortError and ConfigError, in one line.
         """
@@ -98,7 +98,7 @@ class HeadPage:
                         raise ConfigError("--token: the page needs the token that the run printed when it started")
                     await socket.send(json.dumps({"type": "hello", "version": 1, "token": self._token}))
                     while (await _next(socket, "controls")).get("needs_token"):
-                        pass  # of another visitor
+                        pass  # it was sent because of another visitor
                 yield socket, hello
         except ConnectionClosed as error:
             raise PortError(f"{self._url}: the run closed the connection: {error.rcvd or 'without a reason'}") from None
@@ -171,7 +171,7 @@ def server(page: HeadPage) -> MCPServer:
 def serve(url: str, token: str) -> None:
     """Serve the tools on stdin and stdout until stdin ends, in the main thread.
 
-    Ctrl-C and SIGTERM end the process. Raises ConfigError for an address that cannot be one.
+    Ctrl-C and SIGTERM end the process. Raises ConfigError for an invalid address.
     """
     tools = server(HeadPage(url, token))
     for number in (signal.SIGINT, signal.SIGTERM):  # a thread that waits for stdin cannot be interrupted

@@ -1,9 +1,9 @@
-"""A head beside a realtime session: OpenAI's protocol, also of vLLM-Omni and other servers. Sound is 24 kHz PCM.
+"""A head for a realtime session, in OpenAI's protocol, also of vLLM-Omni and other servers. Sound is 24 kHz PCM.
 
     await converse("wss://api.openai.com/v1/realtime?model=gpt-realtime", robot, microphone, key=KEY)
 
-holds a whole conversation over a WebSocket. A program that has a client already keeps it, and hands a
-`RealtimeHead` the events that it sends and receives, as dicts:
+holds a whole conversation over a WebSocket. A program that already has a client keeps it, and passes the events that it
+sends and receives to a `RealtimeHead`, as dicts:
 
     client's event                       server's event                                     the head
     input_audio_buffer.append                                                               hears the person
@@ -39,7 +39,7 @@ Event = Mapping[str, Any]
 
 
 class RealtimeHead:
-    """Reaction of a head to the events of a session. Opens nothing; an event that cannot be used is left out and named.
+    """Reaction of a head to the events of a session. Opens nothing; a bad event is left out and logged.
 
     Args:
         robot: a robot that is running.
@@ -49,21 +49,21 @@ class RealtimeHead:
     def __init__(self, robot: Robot, now: Callable[[], float] = time.monotonic) -> None:
         self.robot_link = HeadLink(robot, "realtime")
         self._now = now
-        self._item: tuple[str, int] | None = None  # id and content index of what is being said
-        self._cut: str | None = None  # the item that was interrupted: the rest of it is not said
+        self._item: tuple[str, int] | None = None  # id and content index of the present speech
+        self._cut: str | None = None  # the item that was interrupted: the rest of it is not spoken
         self._given_s = self._began_s = 0.0
 
     def sent(self, event: Event) -> None:
-        """Take an event of the client: the person's sound."""
+        """Process an event of the client, which may hold the person's sound."""
         if event.get("type") == "input_audio_buffer.append":
             pcm = self._decoded("voice", event.get("audio"))
             if pcm:
                 self.robot_link.hear(pcm, RATE_HZ)
 
     def received(self, event: Event) -> tuple[bytes, Event | None]:
-        """Take an event of the server. Return PCM to be played, b"" without, and an event to be sent back, or None.
+        """Process an event of the server. Return PCM to play, b"" if there is none, and an event to send back, or None.
 
-        That one tells the server, after an interruption, how much of its answer was played.
+        After an interruption, the returned event reports to the server how much of its answer was played.
         """
         kind = event.get("type")
         if kind in DELTAS:
@@ -100,11 +100,11 @@ class RealtimeHead:
         return {"type": "conversation.item.truncate", **place}
 
     def _unplayed_s(self) -> float:
-        """Return how much of the item was not played, where it is played from its first piece on."""
+        """Return how much of the item was not played [s], if it is played from its first piece on."""
         return self._began_s + self._given_s - self._now()
 
     def _decoded(self, what: str, text: object) -> bytes:
-        """Return the bytes of base64; none for other text, and for a piece that is not of 16-bit samples."""
+        """Return the bytes of base64; b"" for other text, and for a piece that is not of 16-bit samples."""
         try:
             pcm = base64.b64decode(text, validate=True) if isinstance(text, str) else None
         except ValueError:
@@ -131,15 +131,15 @@ async def converse(
 
     Args:
         url: ws:// or wss:// address of the session.
-        robot: a robot that is running; made with `play=`, it plays the answers itself.
+        robot: a robot that is running; if it was made with `play=`, it plays the answers itself.
         microphone: pieces of the person's sound as they come, 24 kHz, 16-bit, mono, 20 to 100 ms each.
         key: sent as a bearer token.
-        session: sent as `session.update` before all else.
+        session: sent first, as `session.update`.
         play: called with each piece of an answer, 24 kHz PCM, faster than it is played.
         stop: called when the person interrupts: drop what was not played.
         seen: called with every event of the server, for transcripts and tools.
 
-    Raises PortError, in one line, where the server cannot be reached, refuses the key, or breaks off.
+    Raises PortError, in one line, if the server cannot be reached, refuses the key, or breaks off.
     """
     if not isinstance(url, str) or not url.startswith(("ws://", "wss://")):
         raise InputError(f"url: expected ws://... or wss://..., got {url!r}")
@@ -193,7 +193,7 @@ async def converse(
 
 
 def _plain(text: str | bytes) -> Any:
-    """Return what a JSON text says; None for another text."""
+    """Return the value of a JSON text; None for another text."""
     with suppress(ValueError):
         return json.loads(text)
     return None

@@ -3,10 +3,10 @@
     Pipeline([transport.input(), stt, ..., tts, transport.output(), ListeningHead(robot)])        in and out
     PipelineWorker(pipeline, observers=[HeadObserver(robot)])                                     in
 
-`ListeningHead` hands the robot the person's and the bot's sound that passes it, and pushes a `ListenerEventFrame`
-both ways for each event that the listener decides, before the servos move. Behind the output transport the bot's
-sound arrives while it is played; behind the text to speech it arrives a sentence at once, which the robot plays out by
-the clock. `HeadObserver` needs no place in the pipeline: it sees the frames of all transports.
+`ListeningHead` sends the robot the person's and the bot's sound that passes it, and pushes a `ListenerEventFrame` in
+both directions for each event that the listener decides, before the servos move. After the output transport the bot's
+sound arrives while it is played. After the text to speech a whole sentence arrives at once, which the robot plays in
+real time. `HeadObserver` needs no place in the pipeline: it sees the frames of all transports.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ class ListenerEventFrame(SystemFrame):
 
 
 class ListeningHead(FrameProcessor):
-    """Processor that hands sound to a robot, and pushes its events as frames. All frames pass it unchanged.
+    """Processor that sends sound to a robot, and pushes its events as frames. All frames pass it unchanged.
 
     Args:
         robot: a robot that is running.
-        kinds: of events that are pushed.
+        kinds: kinds of events that are pushed.
 
     Raises InputError for an unknown kind.
     """
@@ -66,18 +66,18 @@ class ListeningHead(FrameProcessor):
         self.robot_link.on(kinds, self._decided)
 
     async def process_frame(self, frame: Frame, direction: FrameDirection) -> None:
-        """Hand over the sound of a frame, and pass the frame on."""
+        """Send the sound of a frame to the robot, and pass the frame on."""
         await super().process_frame(frame, direction)
         if direction is FrameDirection.DOWNSTREAM:
             _hand_over(self.robot_link, frame)
         if isinstance(frame, EndFrame | CancelFrame):
             self.robot_link.close()
         await self.push_frame(frame, direction)
-        if isinstance(frame, StartFrame):  # before it, a pipeline drops whatever is pushed
+        if isinstance(frame, StartFrame):  # a pipeline drops frames pushed before it
             self.robot_link.open()
 
     async def cleanup(self) -> None:
-        """Hand over no further events."""
+        """Stop passing events on."""
         self.robot_link.close()
         await super().cleanup()
 
@@ -86,10 +86,10 @@ class ListeningHead(FrameProcessor):
 
 
 class HeadObserver(BaseObserver):
-    """Observer that hands a robot what the person says, and what the output transport plays.
+    """Observer that sends a robot the sound of the person, and the sound that the output transport plays.
 
     Args:
-        robot: a robot that is running. `Robot.on` and `agents.events` give its events.
+        robot: a robot that is running. Its events come from `Robot.on` and `agents.events`.
     """
 
     def __init__(self, robot: Robot, **of_pipecat: Any) -> None:
@@ -98,7 +98,7 @@ class HeadObserver(BaseObserver):
         self._newest = -1
 
     async def on_push_frame(self, data: FramePushed) -> None:
-        """Hand over the sound of a frame, once: each processor pushes it again."""
+        """Send the sound of a frame to the robot, only once, because each processor pushes it again."""
         frame = data.frame
         if data.direction is not FrameDirection.DOWNSTREAM:
             return
@@ -112,10 +112,10 @@ class HeadObserver(BaseObserver):
 
 
 def _hand_over(link: HeadLink, frame: Frame) -> None:
-    """Hand over sound; drop the speech that waits on an interruption."""
+    """Send sound to the robot; on an interruption, drop the speech that was not played yet."""
     if isinstance(frame, InputAudioRawFrame):
         link.hear(frame.audio, frame.sample_rate, frame.num_channels)
-    elif isinstance(frame, TTSAudioRawFrame | SpeechOutputAudioRawFrame):  # others are music and effects
+    elif isinstance(frame, TTSAudioRawFrame | SpeechOutputAudioRawFrame):  # other frames are music and effects
         link.say(frame.audio, frame.sample_rate, frame.num_channels)
     elif isinstance(frame, InterruptionFrame):
         link.hush()

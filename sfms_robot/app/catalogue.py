@@ -1,4 +1,4 @@
-"""Rows of the heads, listeners, recorded people, serial ports and sound devices at hand; export of a listener."""
+"""Rows of the available heads, listeners, recorded people, serial ports and sound devices; export of a listener."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def shipped_speakers() -> list[Report]:
 
 
 def outputs() -> list[Report]:
-    """Return the rows of `output list`, those of other packages too. `name` begins the value for --output."""
+    """Return the rows of `output list`, with those of other packages. The value of --output begins with `name`."""
     return [
         {"name": name, "description": DESCRIPTIONS.get(name, f"of package {entry.dist.name if entry.dist else '?'}")}
         for name, entry in output_kinds().items()
@@ -77,7 +77,7 @@ def outputs() -> list[Report]:
 def ports() -> Report:
     """Return the tables of `port list`; the name of a serial port is the value for --port. Blocks for a second.
 
-    The description of a sound device names the option for it. Without PortAudio, `microphone_problem` says so.
+    The description of a sound device contains the option for it. `microphone_problem` reports a missing PortAudio.
     """
     found: Report = {"ports": ports_data(), "microphones": [], "loudspeakers": [], "microphone_problem": None}
     try:
@@ -110,7 +110,7 @@ def _sound_devices(playing: bool) -> list[Report]:
 
 
 def export_listener(name: str, out: Path | None, int8: bool, weight_bits: int | None) -> list[Path]:
-    """Write the graphs of a listener, by shipped name or folder, below its folder or `out`, and return the files.
+    """Write the graphs of a listener, by shipped name or folder, into its folder or `out`, and return the files.
 
     `int8`: also graphs with large layers in 8 bits. `weight_bits`: also the weights, stored in 8, 16 or 32 bits (see
     `checkpoint.write_tensors`). Takes a minute. Raises ConfigError, MissingExtra, ModelError.

@@ -1,4 +1,4 @@
-"""Heads among others, over zenoh: `run --fleet NAME` (`FleetHead`), `sfms-robot fleet` (`Fleet`) and its page.
+"""A fleet of heads, over zenoh: `run --fleet NAME` (`FleetHead`), `sfms-robot fleet` (`Fleet`) and its page.
 
     sfms/NAME/state     the status document (`RunStatus`) as JSON: once a second, at every change of state, and as
                         the answer to a query; with a `nonce`, and `malformed`, the count of refused messages
@@ -9,10 +9,10 @@
                         {"command": "knobs", "intensity": {region: value}, "style": {region: value}}
     sfms/NAME/halt      anything that is put here halts the head; the text names the sender. sfms/*/halt halts all
 
-`proof` is an HMAC by the fleet's key over name, command and nonce (`proof`): the key itself is never sent, and a nonce
-counts once, so that a message that was overheard is of no use.
+`proof` is an HMAC with the fleet's key over name, command and nonce (see the function `proof`). The key itself is never
+sent, and a nonce is valid once, so an intercepted message is of no use.
 
-The network may be away: the head continues, and sends again when it is back. Halting by network is a convenience: an
+If the network is lost, the head continues, and sends again when it is back. Halting by network is a convenience: an
 emergency stop is a switch on the head (docs/safety.md).
 """
 
@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 ROOT: Final = "sfms"
 TAKEN: Final = ("listen",)  # names whose keys mean something else
 TELL_S: Final = 1.0
-ASK_S: Final = 2.0  # that heads have to answer
-GONE_S: Final = 3.0  # a head without news for so long is away
+ASK_S: Final = 2.0  # time that heads have to answer
+GONE_S: Final = 3.0  # a head without news for this long counts as away
 PAGE: Final = Path(__file__).with_name("fleet_page.html")
 _LONGEST: Final = 4096
 _LONGEST_NAME: Final = 80
@@ -60,14 +60,14 @@ log = logging.getLogger(__name__)
 
 
 def fleet_name(name: str) -> str:
-    """Return the name of a head. Raises ConfigError for one that it cannot have."""
+    """Return the name of a head in a fleet. Raises ConfigError for a name that is not allowed."""
     if name in TAKEN:
         raise ConfigError(f"--fleet {name!r}: that name is taken ({', '.join(TAKEN)})")
     return check_name(name, "--fleet")
 
 
 def fleet_key(file: Path | None) -> bytes:
-    """Return the key in `file` (None: `fleet.key` beside the overlays of heads), which is made if it is not there.
+    """Return the key in `file` (None: `fleet.key` in the folder of `user_dir`), which is created if it is missing.
 
     Raises ConfigError for a file that others can read, or that holds no key.
     """
@@ -85,7 +85,7 @@ def fleet_key(file: Path | None) -> bytes:
 
 
 def proof(key: bytes, name: str, command: str, nonce: str) -> str:
-    """Return what shows a head that the sender of a command holds the key: HMAC-SHA256 of "NAME COMMAND NONCE", hex."""
+    """Return the proof that the sender of a command holds the key: HMAC-SHA256 of "NAME COMMAND NONCE", hex."""
     return hmac.new(key, f"{name} {command} {nonce}".encode(), "sha256").hexdigest()
 
 
@@ -120,14 +120,14 @@ _COMMAND: Final[TypeAdapter[_Command]] = TypeAdapter(_Command)
 
 
 class FleetControls:
-    """Carries out commands on a run, from any thread.
+    """A receiver of commands, from any thread, that carries them out on a run.
 
     Args:
         run: the controls of the run.
-        name: of the head; `key`: of the fleet (`fleet_key`), which `_Keyed` commands need; None where none is needed.
+        name: name of the head. key: key of the fleet (`fleet_key`), which `_Keyed` commands need; None: none is needed.
 
     Attributes:
-        nonce: goes into the proof of the next command that needs the key.
+        nonce: part of the proof of the next command that needs the key.
     """
 
     def __init__(self, run: RunControls, name: str, key: bytes | None) -> None:
@@ -141,7 +141,7 @@ class FleetControls:
         self.run.halt.close(name or "the fleet", "fleet")
 
     def obey(self, message: bytes) -> dict[str, str]:
-        """Return the effect of a command, or why it has none. Never raises."""
+        """Carry out a command; return it as done, or the reason why it has no effect. Never raises."""
         try:
             command = _COMMAND.validate_json(message if len(message) <= _LONGEST else b"")
             match command:
@@ -167,7 +167,7 @@ class FleetControls:
         return {"done": command.command}
 
     def _check_proof(self, command: _Keyed, key: bytes) -> None:
-        """Raise ConfigError unless a command comes from a holder of the key; the nonce is used up then."""
+        """Raise ConfigError unless a command comes from a holder of the key; such a command uses up the nonce."""
         with self._lock:
             wanted = proof(key, self.name, command.command, self.nonce)
             given = str(command.proof).encode(errors="replace")
@@ -182,8 +182,8 @@ class FleetHead(Observer):
     """`ports.Observer` that sends the state of a run to the fleet, in a thread.
 
     Args:
-        controls: of the run, by the name of this head among others.
-        router: that joins the fleet.
+        controls: controls of the run, with the name of this head in the fleet.
+        router: router that connects the fleet.
 
     Raises ConfigError, MissingExtra.
     """
@@ -197,14 +197,14 @@ class FleetHead(Observer):
         self._thread = start_thread(self._work, "fleet")
 
     def tick(self, seen: Tick) -> None:
-        """Send the state soon where it has changed."""
+        """Send the state soon if it has changed."""
         state = seen.state, seen.why
         if state != self._state:
             self._state = state
             self._news.set()
 
     def close(self) -> None:
-        """Send how the run ended, and disconnect. Idempotent."""
+        """Send the final state of the run, and disconnect. Idempotent."""
         self._over = True
         self._news.set()
         self._thread.join(TELL_S)
@@ -227,7 +227,7 @@ class FleetHead(Observer):
             lambda sample: self._controls.halt(sample.payload.to_bytes()[:_LONGEST_NAME].decode(errors="replace")),
         )
         while True:
-            over = self._over  # read first: the last state is sent after it
+            over = self._over  # read before sending, so that the last state is sent
             session.put(f"{key}/state", self._state_json())
             if over:
                 return
@@ -256,12 +256,12 @@ class FleetHead(Observer):
         return answer
 
 
-# --- the other side -------------------------------------------------------------------------------------------------
+# --- the side that watches and commands -----------------------------------------------------------------------------
 
 
 @contextmanager
 def open_fleet(zenoh: Path | None, insecure: bool = False, key: Path | None = None) -> Iterator[Fleet]:
-    """Connect to the router that joins the heads, while inside. Blocks for `AWAY_S` at most.
+    """Connect to the router of the heads while inside. Blocks for `AWAY_S` at most.
 
     Raises PortError when no router answers, ConfigError, MissingExtra.
     """
@@ -277,7 +277,7 @@ class Fleet:
     """The heads behind a router (`open_fleet`). `key`: file of the fleet's key (`fleet_key`).
 
     Attributes:
-        malformed: count of messages that hold no document.
+        malformed: number of messages that hold no document.
     """
 
     session: Any
@@ -289,12 +289,12 @@ class Fleet:
         return sorted(self._ask(f"{ROOT}/*/state", b""), key=lambda each: str(each.get("name")))
 
     def command(self, heads: Sequence[str], command: Facts) -> list[Facts]:
-        """Send a command to `heads`, or all where none is named; return their answers."""
+        """Send a command to `heads`, or to all if none is named; return their answers."""
         keys = [f"{ROOT}/{fleet_name(head)}/command" for head in heads] or [f"{ROOT}/*/command"]
         return [answer for key in keys for answer in self._ask(key, json.dumps(dict(command)).encode())]
 
     def resume(self, heads: Sequence[str]) -> list[Facts]:
-        """Resume `heads`, or all, by the fleet's key. Raises ConfigError for a key that cannot be used."""
+        """Resume `heads`, or all, with the fleet's key. Raises ConfigError for a key that cannot be used."""
         key = fleet_key(self.key)
         answers: list[Facts] = []
         for each in self.states():
@@ -305,13 +305,13 @@ class Fleet:
         return answers
 
     def halt(self, heads: Sequence[str], by: str) -> list[Facts]:
-        """Halt `heads`, or all; sent twice: on the keys for halting, which need no answer, and as a command."""
+        """Halt `heads`, or all. It is sent twice: on the keys for halting, which need no answer, and as a command."""
         for key in [f"{ROOT}/{fleet_name(head)}/halt" for head in heads] or [f"{ROOT}/*/halt"]:
             self.session.put(key, by.encode())
         return self.command(heads, {"command": "halt", "by": by})
 
     def follow(self, receive: Callable[[Facts], None]) -> None:
-        """Call `receive` with every document from now on, in a thread of zenoh's."""
+        """Call `receive` with every document from now on, in a thread of zenoh."""
         self.session.declare_subscriber(f"{ROOT}/*/state", lambda sample: self._read(sample, receive))
 
     def _ask(self, key: str, payload: bytes) -> list[Facts]:
@@ -335,7 +335,7 @@ class Fleet:
 
 
 def tile(name: str, document: Facts, age_s: float = 0.0) -> Facts:
-    """Return a summary of a head; `here` False: without news for `GONE_S`, or it has ended."""
+    """Return a summary of a head; `here` is False if it has ended or sent no news for `GONE_S`."""
     state = str(document.get("state", "?"))
     return {
         "name": name,
@@ -352,7 +352,7 @@ def tile(name: str, document: Facts, age_s: float = 0.0) -> Facts:
 def fleet_page(fleet: Fleet, port: int) -> LocalServer:
     """Serve a tile per head and a button that halts all, on loopback, until `close`. Raises PortError.
 
-    GET /: the page. GET /heads: {"heads": [tile, ...]}. POST /halt, /resume: {"heads": [name, ...]}, none: all.
+    GET /: the page. GET /heads: {"heads": [tile, ...]}. POST /halt, /resume: {"heads": [name, ...]}; no name: all.
     """
     import asyncio
 
@@ -362,7 +362,7 @@ def fleet_page(fleet: Fleet, port: int) -> LocalServer:
 
     from sfms_robot.viewer.web_server import LocalServer, json_body
 
-    newest: dict[str, tuple[float, Facts]] = {}  # of each head, and when it came
+    newest: dict[str, tuple[float, Facts]] = {}  # newest document of each head, and when it came
 
     def put(document: Facts) -> None:
         newest[str(document.get("name", "?"))] = time.monotonic(), document

@@ -1,13 +1,13 @@
-"""A head and its servos: the half of the composition root that all commands which move a head share.
+"""A head and its servos: the half of the composition root that is shared by all commands that move a head.
 
-    prepare_head    what can be checked before anything is opened: the head's file, its ports, what is confirmed
+    prepare_head    checks before anything is opened: the head's file, its ports, what is confirmed
     calibrated_head the head's file with the overlay of this build, for the servos that answer
     build_motion    the parts between a plan and the bus: timeline, retargeter, limiter, heat
     run_log         the figures of a run, with the audit of its commands
-    build_bus       every servo of the head behind one bus, emulated ones and real ones alike
+    build_bus       every servo of the head behind one bus, both emulated and real
     open_head       all of them: emulated servos started, ports opened, every servo identified; torque is untouched
 
-`app.session` decides what is played on it.
+`app.session` decides what is played on the head.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ NO_BUS_HZ: Final = 50.0  # rate of the loop of a head without servos
 
 @dataclass(frozen=True, kw_only=True)
 class OpenHead:
-    """A head whose servos are connected; torque is untouched. `opened`: where its buses are."""
+    """A head whose servos are connected; torque is untouched. `opened`: the places of its buses."""
 
     options: HeadOptions
     config: Head
@@ -78,7 +78,7 @@ class OpenHead:
         return {joint: {"position_rad": each.position_rad, "fault": each.fault} for joint, each in polled}
 
     def digests(self) -> Report:
-        """Return SHA-256 and count of the bytes on each emulated wire, by which runs are compared."""
+        """Return SHA-256 and count of the bytes on each emulated wire, for comparisons of runs."""
         return {
             name: dict(zip(("sha256", "bytes"), chain.digest(), strict=True))
             for name, chain in self.opened.items()
@@ -87,7 +87,7 @@ class OpenHead:
 
 
 def doctor_command(head: str, port: str) -> str:
-    """Return the command that corrects what the servos of a head store, as it can be typed."""
+    """Return the command line that corrects the stored values of a head's servos."""
     return f"sfms-robot doctor --port {quote(port)} --head {quote(head)} --fix"
 
 
@@ -111,7 +111,7 @@ def prepare_head(options: HeadOptions) -> Head:
     if options.port == SIM:
         return head
     where = devices(head, options.port)
-    # Their servos report no position, so that they jump when they come on.
+    # Hobby servos report no position, so they jump when they come on.
     jumping = [name for name, joint in head.joints.items() if family_named(head.buses[joint.bus].family).board]
     if jumping and not options.confirmed:
         raise ConfigError(
@@ -125,10 +125,10 @@ def prepare_head(options: HeadOptions) -> Head:
 
 @contextmanager
 def open_head(options: HeadOptions) -> Iterator[OpenHead]:
-    """Connect to every servo of a head. Blocks for as long as identifying takes. Raises RobotError."""
+    """Connect to every servo of a head. Blocks while the servos are identified. Raises RobotError."""
     prepare_head(options)
     clock: Clock = VirtualClock() if options.fast else RealClock()
-    kept: dict[str, Port] = {}  # by bus, open since their servos were identified
+    kept: dict[str, Port] = {}  # ports by bus, open since their servos were identified
     with ExitStack() as stack:
 
         @stack.callback
@@ -156,15 +156,16 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
 
 
 def calibrated_head(name: str, port: str, clock: Clock, kept: dict[str, Port]) -> Head:
-    """Return the head as it may move on this port.
+    """Return the head with the ranges and speeds that its calibration allows on this port.
 
-    On emulated servos every head counts as calibrated. On real ones each measured servo is identified first; a joint
-    whose measurement does not hold, and an unmeasured one of a head to be calibrated first, holds back. The ports that
-    are opened for this stay open, by bus, in `kept`: some adapters reset their servos at every opening.
+    On emulated servos every head counts as calibrated. On real servos each measured servo is identified first. A joint
+    whose measurement does not hold moves little and slowly, as does an unmeasured joint of a head that must be
+    calibrated first. The ports that are opened for this stay open, by bus, in `kept`: some adapters reset their servos
+    at every opening.
 
     Raises ConfigError, PortError.
     """
-    head = load_head(name, servos=False)  # `prepare_head` has judged it
+    head = load_head(name, servos=False)  # `prepare_head` has checked it
     if not head.joints:
         return head
     overlay, sha256 = load_overlay(head), head_hash(name)
@@ -199,7 +200,7 @@ def identify(
 ) -> dict[str, Identity | None]:
     """Return the servo that answers for each of `joints`, None if none does. Writes nothing. Raises PortError.
 
-    Ports are closed again, or stay open in `kept`, by bus.
+    Ports are closed again, or stay open in `kept`, by bus, if it is given.
     """
     servos: dict[str, Identity | None] = {}
     for name, bus in head.buses.items():
@@ -240,7 +241,7 @@ def build_motion(head: Head, rate_hz: float) -> Motion:
     retargeter = HeadRetargeter(head, 1.0 / rate_hz)
     leads_s = np.array([joint.lag_ms / 1e3 for joint in head.joints.values()])
     if len(neck := retargeter.neck_columns):
-        leads_s[neck] = leads_s[neck].max()  # its joints show one pose together
+        leads_s[neck] = leads_s[neck].max()  # the neck's joints show one pose together
     safety = [head.safety_of(joint) for joint in head.joints]
     holds = np.array([each.halt == "hold" for each in safety], np.bool_)
     holds[neck] |= np.array([safety[column].halt is None for column in neck], np.bool_)
@@ -276,7 +277,7 @@ def build_bus(
     """Return the head's bus, not yet connected.
 
     `confirmed`: hobby servos may jump when their pulses come on. `without`: joints whose servos are left alone.
-    `doctor`: see `BusServo`. `kept`: ports that are open already, by bus; the first connection takes them out.
+    `doctor`: see `BusServo`. `kept`: ports that are open already, by bus; the first connection removes them from it.
     """
     buses: dict[str, Bus] = {}
     for name, where in opened.items():
@@ -333,9 +334,9 @@ def build_one(
     deadline_s = config.read_deadline_ms / 1e3
     if isinstance(where, Chain):
         deadline_s = max(deadline_s, where.read_deadline_s)
-        if not where.virtual:  # a busy computer would trip it, and no servo is in danger
+        if not where.virtual:  # a busy computer would trip the watchdog, and no servo is in danger
             config = config.replaced(watchdog_ms=0)
-    open_port = port_of(where, config, clock)  # named while the adapter is there: it may come back as another ttyUSB
+    open_port = port_of(where, config, clock)  # resolved while the adapter is present: it may return as another ttyUSB
     return family.build(
         name,
         servos,
@@ -352,10 +353,10 @@ def build_one(
 
 
 def check_safety(head: Head, joints: Mapping[str, Joint]) -> None:
-    """Check joints against the firmware maps of their models. A rule that no servo keeps is worse than none.
+    """Check joints against the firmware maps of their models. A rule that no servo keeps is worse than no rule.
 
-    Raises ConfigError for a limit that a joint's servo cannot keep, a register that a run must not write, or more
-    turns than it makes.
+    Raises ConfigError for a limit that a joint's servo cannot keep, a register that a run must not write, or a range
+    of more turns than the servo makes.
     """
     for name, joint in joints.items():
         table = load_firmware_map(joint.model)
@@ -390,7 +391,7 @@ def _check_limits(head: Head, name: str, table: FirmwareMap) -> None:
 
 
 def _check_turns(head: Head, name: str, table: FirmwareMap) -> None:
-    """A geared joint may need more than one turn of its servo, and only some models count them."""
+    """Raise ConfigError if a geared joint needs more turns than its servo makes; only some models count turns."""
     joint, turn = head.joints[name], table.ticks_per_revolution
     ticks = Calibration({name: joint}, np.array([turn]))
     low, high = int(ticks.low_ticks[0]), int(ticks.high_ticks[0])

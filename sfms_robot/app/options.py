@@ -1,7 +1,8 @@
 """The options of a run, and everything that can be checked or started from them before anything is loaded.
 
-One model serves `sfms-robot run` and `demo`, `Robot(...)` and the report. The checks use the functions of the run
-itself; `session.run` checks the rest. Standard library only: a wrong name is reported as soon as Python has started.
+`sfms-robot run` and `demo`, `Robot(...)` and the report share one model. The checks use the functions of the run
+itself; `session.run` checks the rest. Only the standard library is needed here, so a wrong name is reported as soon
+as Python has started.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 SIM: Final = "sim"  # the port of emulated servos
 ENGINES: Final[tuple[EngineName, ...]] = ("auto", "onnx", "torch")
 RECORD_FORMATS: Final[tuple[RecordFormat, ...]] = ("json", "ros2")
-FEEDS: Final = ("voice", "face")  # of a person
+FEEDS: Final = ("voice", "face")  # what a run may receive from a person
 PAGE: Final = "sfms_robot.app.head.head_scene:main"
 _IN_TERMINALS: Final = ("www-browser", "links", "elinks", "lynx", "w3m", "browsh")
 
@@ -42,12 +43,12 @@ class HeadOptions:
     """A head and its servos.
 
     Attributes:
-        head: shipped name, or a folder with a head.yaml; of a run also "none": no servos.
+        head: shipped name, or a folder with a head.yaml; for a run also "none": no servos.
         port: "sim", "auto", a device, or NAME=DEVICE[,NAME=DEVICE] for a head of several buses.
         fast: virtual time; needs emulated servos.
         yes: hobby servos may jump when they come on.
         without: joints whose servos are not addressed at all.
-        dry_run: of a run: torque stays off.
+        dry_run: for a run: torque stays off.
     """
 
     head: str = "face28"
@@ -59,7 +60,7 @@ class HeadOptions:
 
     @property
     def confirmed(self) -> bool:
-        """True if hobby servos may be connected, which makes them jump where torque comes on."""
+        """True if hobby servos may be connected; they jump if torque comes on."""
         return self.yes or self.dry_run
 
 
@@ -100,7 +101,7 @@ class RunOptions(HeadOptions):
 
     @property
     def hears(self) -> str:
-        """`audio`, where "default" is the microphone for servos that are not emulated here."""
+        """`audio`, but the microphone for "default" if the servos are real and the run is not a dry run."""
         return "mic" if self.audio == "default" and self.port != SIM and not self.dry_run else self.audio
 
     @property
@@ -110,7 +111,7 @@ class RunOptions(HeadOptions):
 
     @property
     def visitor_feeds(self) -> list[str]:
-        """Those of `FEEDS` that a visitor of the page brings."""
+        """The `FEEDS` that come from a visitor of the page."""
         given = zip(FEEDS, (self.hears, self.face), strict=True)
         return [feed for feed, kind in given if split_kind(kind)[0] == BROWSER]
 
@@ -119,7 +120,7 @@ _DEFAULTS: Final = RunOptions()
 
 
 def check_names(options: RunOptions) -> None:
-    """Check that head, listener, port and files exist, and the port of the status is free.
+    """Check that head, listener, port and files exist, and that the status port is free.
 
     Raises ConfigError, PortError.
     """
@@ -149,7 +150,7 @@ def engine_named(name: str) -> EngineName:
 
 
 def record_format_named(name: str) -> RecordFormat:
-    """Return the format of a recording of that name. Raises ConfigError."""
+    """Return the recording format of that name. Raises ConfigError."""
     if name not in RECORD_FORMATS:
         raise ConfigError(f"--record-format: expected one of {', '.join(RECORD_FORMATS)}, got {name!r}")
     return name
@@ -188,7 +189,7 @@ def calmed(per_minute: Sequence[str], addressed: str) -> Calmness:
 def begin_listening(options: RunOptions) -> PlanFeed:
     """Return the listener, which loads or connects from now on, for `session.run(feed=...)`. The caller closes it.
 
-    One on another machine chooses its engine itself. Raises ConfigError, MissingExtra.
+    A listener on another machine chooses its engine itself. Raises ConfigError, MissingExtra.
     """
     if not options.listener.startswith(REMOTE):
         from sfms_robot.listeners.process import ListenerProcess
@@ -203,10 +204,10 @@ def begin_listening(options: RunOptions) -> PlanFeed:
 def begin_page(
     address: str | None, certificate: Path | None = None, key: Path | None = None, *, options: RunOptions = _DEFAULTS
 ) -> PageProcess | None:
-    """Return the page's process, which starts from now on; None where no page is wanted. The caller closes it.
+    """Return the page's process, which starts from now on; None if no page is wanted. The caller closes it.
 
-    `address`: of `--view`; a run that takes a visitor as its person has a page without one. Raises ConfigError for
-    what no page can show.
+    `address`: value of `--view`; a run whose person is a visitor has a page without it. Raises ConfigError for a run
+    that no page can show.
     """
     if address is None:
         if not options.visitor_feeds:
@@ -231,7 +232,7 @@ def can_open(environment: Mapping[str, str], platform: str) -> bool:
 
 
 def open_browser(url: str) -> bool:
-    """Show `url` in a browser window of this computer; return whether that can be. Never blocks, raises nothing."""
+    """Show `url` in a browser window of this computer; return False if that is impossible. Never blocks or raises."""
     if not can_open(os.environ, sys.platform):
         return False
     import webbrowser  # only for the one command that opens a window

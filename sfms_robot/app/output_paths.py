@@ -1,4 +1,4 @@
-"""Files that a command will write, checked before the work begins; and the style of pictures."""
+"""Checks of files that a command will write, before the work begins; and the style of pictures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _DPI: Final = 110
 
 
 def checked_file(file: Path, option: str) -> Path:
-    """Return the file. Raises ConfigError, which names the option, where none can be written."""
+    """Return the file. Raises ConfigError, which names the option, if it cannot be written."""
     if file.is_dir():
         raise ConfigError(f"{option} {file}: cannot be written: is a folder")
     if not file.parent.is_dir():
@@ -29,7 +29,7 @@ def checked_file(file: Path, option: str) -> Path:
 
 
 def made_folder(folder: Path, option: str) -> Path:
-    """Make the folder, and return it. Raises ConfigError, which names the option, where it cannot be made."""
+    """Create the folder, and return it. Raises ConfigError, which names the option, if it cannot be created."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -41,7 +41,7 @@ def made_folder(folder: Path, option: str) -> Path:
 
 
 def checked_png(png: Path, option: str) -> Path:
-    """Return the file, before the work for it begins. Raises ConfigError where no PNG can be written there."""
+    """Return the file, checked before the work begins. Raises ConfigError if no PNG can be written there."""
     if png.suffix.lower() != ".png":
         raise ConfigError(f"{option} {png}: expected the name of a picture, FILE.png")
     return checked_file(png, option)
@@ -55,7 +55,7 @@ def new_figure(width_in: float, height_in: float, dpi: int = _DPI) -> Figure:
 
 
 def save(figure: Figure, png: Path) -> None:
-    """Write a picture. Raises ConfigError where that cannot be done."""
+    """Write a picture. Raises ConfigError if it cannot be written."""
     try:
         png.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(png)
@@ -64,7 +64,7 @@ def save(figure: Figure, png: Path) -> None:
 
 
 def plain(axes: Axes, size: float = 8, grid: Literal["both", "x"] = "both") -> None:
-    """Draw no box, and a faint grid."""
+    """Remove the box around `axes`, and draw a faint grid."""
     axes.tick_params(labelsize=size, colors=INK, length=2, which="both")
     axes.grid(axis=grid, color=RULE, linewidth=0.6)
     axes.set_axisbelow(True)

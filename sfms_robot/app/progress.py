@@ -1,9 +1,9 @@
 """Progress of work that takes more than a moment, on stderr: a bar on a terminal, else a plain line now and then.
 
-    with bar("scanning") as moved:              # moved(steps done, steps in all, what is looked at)
+    with bar("scanning") as moved:              # moved(steps done, total steps, current item)
     for dyad in tracked(dyads, "listening"):    # the same over a sequence
 
-The bar's marker and clock run while one step takes long, and it estimates the rest of the time. Stdout is for results.
+The bar's marker and clock run while one step takes long, and it estimates the remaining time. Stdout is for results.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rich.progress import (
 )
 from rich.progress import Progress as RichProgress
 
-Progress = Callable[[float, float, str], None]  # steps done, steps in all (0: unknown), what is looked at
+Progress = Callable[[float, float, str], None]  # steps done, total steps (0: unknown), current item
 
 PLAIN_EVERY_S: Final = 10.0
 _Item = TypeVar("_Item")
@@ -43,7 +43,7 @@ def no_progress(done: float, total: float, what: str) -> None:
 def bar(title: str, hidden: bool = False) -> Iterator[Progress]:
     """Show progress on stderr; yield the function that moves it. Bars may be nested.
 
-    Workers of a pool show none, and of processes that train together only the first does.
+    Workers of a pool show no bar; of processes that train together, only the first shows one.
     """
     if hidden or multiprocessing.parent_process() is not None or os.environ.get("RANK", "0") != "0":
         yield no_progress
@@ -58,7 +58,7 @@ def bar(title: str, hidden: bool = False) -> Iterator[Progress]:
 
 
 def tracked(items: Iterable[_Item], title: str, total: int | None = None) -> Iterator[_Item]:
-    """Yield the items under a bar. `total`: their number, where they do not have a length."""
+    """Yield the items while a bar is shown. `total`: number of items, if they have no length."""
     count = total if total is not None else len(items) if isinstance(items, Collection) else 0
     with bar(title) as moved:
         for done, item in enumerate(items):
@@ -74,7 +74,7 @@ def console() -> Console:
 
 @contextmanager
 def rich_bar(*figures: ProgressColumn, transient: bool) -> Iterator[RichProgress]:
-    """Show bars on a terminal: title, bar, share, `figures`, the time so far and an estimate of the rest.
+    """Show bars on a terminal: title, bar, share, `figures`, the time so far and an estimate of the remaining time.
 
     Log lines appear above them.
     """
@@ -97,7 +97,7 @@ def rich_bar(*figures: ProgressColumn, transient: bool) -> Iterator[RichProgress
     )
     with bars:
         for each in handlers:
-            each.setStream(sys.stderr)  # rich's, which prints above the bars
+            each.setStream(sys.stderr)  # the stream of rich, which prints above the bars
         try:
             yield bars
         finally:
@@ -106,11 +106,11 @@ def rich_bar(*figures: ProgressColumn, transient: bool) -> Iterator[RichProgress
 
 
 class TimeLeft:
-    """An estimate of the rest of the time, from the steps done since the first call."""
+    """An estimate of the remaining time, from the steps done since the first call."""
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s, self._began_s = now_s, now_s()
-        self._first: float | None = None  # where a resumed training begins
+        self._first: float | None = None  # steps done at the first call, where a resumed training begins
 
     @property
     def passed_s(self) -> float:
@@ -118,7 +118,7 @@ class TimeLeft:
         return self._now_s() - self._began_s
 
     def __call__(self, done: float, total: float) -> str:
-        """Return "about 40 s left"; empty where nothing is known yet."""
+        """Return a text such as "about 40 s left"; empty while no estimate is possible."""
         self._first = done if self._first is None else self._first
         new = done - self._first
         return f"about {in_words(self.passed_s * (total - done) / new)} left" if total and new > 0 else ""
@@ -127,7 +127,7 @@ class TimeLeft:
 class PlainBar:
     """Lines in place of a bar, for a stderr that is not a terminal: one every `PLAIN_EVERY_S` at most.
 
-    `last`: and one when all steps are done.
+    `last`: also print a line when all steps are done.
     """
 
     def __init__(self, title: str, now_s: Callable[[], float] = time.monotonic, last: bool = False) -> None:

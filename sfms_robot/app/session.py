@@ -1,4 +1,4 @@
-"""Composition root: where concrete parts are put together, for every command that moves a head.
+"""Composition root: concrete parts are put together here, for every command that moves a head.
 
     open_head       the servos, and the parts between a plan and them (`app.open_head`); torque is untouched
     drive_head      torque on, the loop, rest, torque off, and the report
@@ -50,7 +50,7 @@ from sfms_robot.sources.registry import open_source, split_kind
 
 logger = logging.getLogger(__name__)
 
-LOOK_S: Final = 2.0  # for which a point holds that the peer of an output asks to look at
+LOOK_S: Final = 2.0  # duration of a look at a point that the peer of an output requests
 
 Panel = Callable[[RunControls], AbstractContextManager[object]]
 
@@ -59,7 +59,7 @@ Panel = Callable[[RunControls], AbstractContextManager[object]]
 
 
 def run_parts(opened: OpenHead, source: Source, feed: PlanFeed, **more: Any) -> Parts:
-    """Return the parts of a run on an open head: a person and a listener; `more` replaces parts of the head's own."""
+    """Return the parts of a run on an open head with a person and a listener; `more` replaces parts of the head."""
     own = {"bus": opened.bus, "observers": (), "ignored": frozenset(opened.options.without)}
     return Parts(source=source, feed=feed, **vars(opened.motion) | own | more)
 
@@ -74,11 +74,11 @@ def drive_head(
 ) -> Report:
     """Switch torque on, run the loop, come to rest, switch torque off, and report. Blocks until then.
 
-    An exception on the way is reported, not raised: the head is at rest. A drive that would end as done or interrupted
-    ends as failed, by TorqueError, where torque could not be confirmed off.
+    An exception meanwhile is reported, not raised, and the head is at rest. A drive that would end as done or
+    interrupted ends as failed, with TorqueError, if torque could not be confirmed off.
 
     Args:
-        duration_s: None without an end.
+        duration_s: longest duration of the drive; None: no limit.
         log: is filled; other threads may read it meanwhile.
     """
     log = log or run_log(opened.config, opened.rate_hz)
@@ -130,14 +130,14 @@ def run(
     """Listen until the duration is over or the run is interrupted. Blocks until then, and returns the report.
 
     The listener loads in its own process while the head is opened. After torque came on nothing is raised any more:
-    the report says `"exit": "failed"` and why, and the head is at rest.
+    the report has `"exit": "failed"` and the error, and the head is at rest.
 
     Args:
-        panel: a context manager of the controls, which shows the run and takes keys.
-        source, feed, controls: instead of those that the options name.
-        timeline: what is played instead of the listener's plans; nothing is added to it.
+        panel: returns a context manager for the controls, which shows the run and reads keys.
+        source, feed, controls: used instead of those that the options name.
+        timeline: played instead of the listener's plans; nothing is added to it.
         observers: see `Parts`; the caller closes them.
-        more: further entries of the status and of the report.
+        more: returns further entries of the status and of the report.
 
     Raises RobotError before torque came on.
     """
@@ -149,7 +149,7 @@ def run(
     controls = controls or RunControls(head, options)
     interrupt, halt, knobs = controls.interrupt, controls.halt, controls.knobs
     facts = {"head": head.name, "port": options.port, "listener": options.listener_name}
-    with ExitStack() as stack:  # until all is closed again
+    with ExitStack() as stack:  # closes everything at the end
         if signals:
             stack.enter_context(signals_to(interrupt))
             stack.enter_context(halt_signals(halt))
@@ -157,8 +157,8 @@ def run(
             stack.enter_context(halt_switch(options.halt_on, halt))
         sinks = _outputs(options, controls, stack)
         server = None
-        if options.status is not None:  # a port that is in use is found before a listener is loaded
-            from sfms_robot.viewer.web_server import status_server  # a web server: 50 ms
+        if options.status is not None:  # a port in use is detected before a listener is loaded
+            from sfms_robot.viewer.web_server import status_server  # importing a web server takes 50 ms
 
             server = stack.enter_context(closing(status_server(options.status)))
             logger.log(NOTE, "status: %s%s", server.url, server.note)
@@ -228,9 +228,9 @@ def run(
 
 
 def _check(options: RunOptions) -> None:
-    """Raise ConfigError for options that exclude one another or cannot work here, before anything is opened."""
+    """Raise ConfigError, before anything is opened, for options that exclude one another or cannot work here."""
     if options.fleet is not None:
-        from sfms_robot.app.fleet import fleet_key, fleet_name  # its messages are models: 30 ms
+        from sfms_robot.app.fleet import fleet_key, fleet_name  # its messages are pydantic models, 30 ms to import
 
         fleet_name(options.fleet)
         session_config("call", options.router)
@@ -278,11 +278,11 @@ def _outputs(options: RunOptions, controls: RunControls, stack: ExitStack) -> li
 def _open(
     options: RunOptions, controls: RunControls, source: Source | None, feed: PlanFeed | None, stack: ExitStack
 ) -> tuple[OpenHead, Source, PlanFeed | None]:
-    """Open the head, the person and the listener side by side; without a listener in a dry run. Blocks until then."""
+    """Open the head, the person and the listener in parallel; a dry run has no listener. Blocks until all are open."""
     if feed is None and not options.dry_run:
         feed = _feed(replace(options, calmness=controls.calmness), stack)
     controls.set_rates = getattr(feed, "calm", None)
-    if source is None:  # in a thread: a microphone takes a second, and so does the head
+    if source is None:  # in a thread: a microphone takes a second to open, and so does the head
         worker = ThreadPoolExecutor(1, "source")
         opening = worker.submit(
             open_source,
@@ -310,11 +310,11 @@ def _open(
 
 
 def _feed(options: RunOptions, stack: ExitStack) -> PlanFeed:
-    """Return the listener: inline in virtual time, so that a seed repeats; else in its own process, which loads now."""
+    """Return the listener: inline in virtual time, for reproducible runs; else in its own process, which loads now."""
     listener_folder(options.listener)
     feed: PlanFeed
     if options.fast:
-        from sfms_robot.listeners.registry import engine_name, load_listener  # networks: only here in this process
+        from sfms_robot.listeners.registry import engine_name, load_listener  # networks are imported only here
 
         listener = load_listener(options.listener, calmness=options.calmness, engine=options.engine, threads=1)
         feed = InlineFeed(listener, options.seed, engine_name(listener))

@@ -1,4 +1,4 @@
-"""Where the buses of a head are: emulated servos in a process of their own, or serial devices."""
+"""The buses of a head: emulated servos in a separate process, or serial devices."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from sfms_robot.servo.registers import Table
 from sfms_robot.servo.stored_settings import JointNeeds, home_ticks, multi_turn
 
 _NEW: Final = StoredRegisters()
-_PATIENCE_S: Final = 1.0  # the longest that a port waits for an emulator in real time
+_PATIENCE_S: Final = 1.0  # longest wait of a port for an emulator in real time
 _CHUNK: Final = 4096
-HANGING: Final = 0.3  # fraction of the way from rest to its lower end, where nothing pulls hard
-BEYOND_RAD: Final = radians(2.0)  # how far a stop lies outside the range of the head's file
+HANGING: Final = 0.3  # fraction of the way from rest to its lower end, of a joint that bears little load
+BEYOND_RAD: Final = radians(2.0)  # distance of a mechanical stop from the range of the head's file
 
 Opened = Mapping[str, Chain | str]  # per named bus: an emulated chain, or a serial device
 
@@ -38,7 +38,7 @@ def devices(head: Head, port: str) -> dict[str, str]:
 
 @contextmanager
 def open_wires(head: Head, port: str, fast: bool = False) -> Iterator[Opened]:
-    """Give the place of each bus of the head: emulated servos, which live as long as this does, or devices.
+    """Yield the place of each bus of the head: emulated servos, which run while inside, or devices.
 
     `fast`: virtual time.
     """
@@ -50,7 +50,7 @@ def open_wires(head: Head, port: str, fast: bool = False) -> Iterator[Opened]:
 
 
 def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> OpenPort:
-    """Return a function that opens the port of a bus, again after its device was unplugged. Raises PortError."""
+    """Return a function that opens the port of a bus, also again after an unplugging. It raises PortError."""
     if isinstance(where, str):
         return partial(SerialPort, stable_name(where), bus.baud, clock, bus.rs485)
     if where.virtual:
@@ -59,20 +59,20 @@ def port_of(where: Chain | str, bus: BusConfig, clock: Clock) -> OpenPort:
 
 
 class EmulatedPort(SerialPort):
-    """A port to emulated servos in real time. A silence is one only if the emulator confirms it.
+    """A port to emulated servos in real time. Silence counts only if the emulator confirms it.
 
-    The emulator shares the computer's processors, so an answer may be late although its servo is there. When no byte
-    came by a deadline, the port asks the emulator, on its control socket, for the number of bytes that it has sent, and
-    waits for those that are missing. Meanwhile the port's clock stands still: what is late is this computer.
+    The emulator shares the computer's processors, so an answer may be late although its servo is there. If no byte came
+    by a deadline, the port requests, on the emulator's control socket, the number of bytes that it has sent, and waits
+    for the missing ones. Meanwhile the port's clock stands still, since the delay is caused by this computer.
     """
 
     def __init__(self, device: str, control: str, baud: int, clock: Clock) -> None:
         self._late_s = self._written_s = 0.0
         self._written = self._got = 0
-        self._settled = True  # the emulator has confirmed that nothing is to come
-        self._owed = 0  # answers of the emulator that have not come
+        self._settled = True  # the emulator has confirmed that no more bytes will come
+        self._owed = 0  # answers of the emulator that are still missing
         self._control = emulator_control(control)
-        self._ask()  # it counts bytes from here on
+        self._ask()  # the emulator counts bytes from here on
         try:
             super().__init__(device, baud, clock)
         except BaseException:
@@ -95,7 +95,7 @@ class EmulatedPort(SerialPort):
         return data
 
     def discard_input(self) -> None:
-        while data := SerialPort.read(self, _CHUNK, 0.0):  # counted, as a reset of the driver would not
+        while data := SerialPort.read(self, _CHUNK, 0.0):  # read, since a reset of the driver would not count them
             self._got += len(data)
 
     def now_s(self) -> float:
@@ -111,22 +111,22 @@ class EmulatedPort(SerialPort):
     def _late_bytes(self, n: int, patience_s: float) -> bytes:
         """Return bytes that the emulator has sent and that were not read; empty if there are none.
 
-        `patience_s`: from the last write to the deadline, which the emulator has too, from when the bytes came to it.
+        `patience_s`: time from the last write to the deadline. The emulator has the same time from receiving the bytes.
         """
         sent = self._ask(patience_s)
         self._settled = sent is not None and sent <= self._got
         if sent is None or self._settled:
             return b""
         data = SerialPort.read(self, n, self.now_s() + _PATIENCE_S)
-        if not data:  # lost: a terminal that is full takes no more
+        if not data:  # the bytes are lost: a full terminal accepts no more
             self._got, self._settled = sent, True
         return data
 
     def _ask(self, patience_s: float = 0.0) -> int | None:
-        """Return the bytes that the emulator has sent so far; None if it does not answer in time."""
+        """Return the number of bytes that the emulator has sent so far; None if it does not answer in time."""
         answers = b""
         try:
-            self._control.settimeout(_PATIENCE_S if not self._owed else 0.0)  # one that hangs is waited for once
+            self._control.settimeout(_PATIENCE_S if not self._owed else 0.0)  # a hung emulator is waited for once
             while self._owed:
                 self._owed -= self._control.recv(_CHUNK).count(b"\n") or self._owed
             self._control.settimeout(_PATIENCE_S + patience_s)
@@ -134,7 +134,7 @@ class EmulatedPort(SerialPort):
             self._owed = 1
             while not answers.endswith(b"\n"):
                 if not (part := self._control.recv(_CHUNK)):
-                    return None  # it is gone, which the device shows
+                    return None  # the emulator has ended, which the device shows
                 answers += part
             self._owed = 0
             return int(answers.removeprefix(b"quiet "))
@@ -150,8 +150,8 @@ def calibration_of(joints: dict[str, Joint]) -> Calibration:
 def emulated(head: Head, stored: StoredRegisters = _NEW) -> dict[str, list[EmulatedServo]]:
     """Return, by bus, the servos of a head that was switched off: sagged onto its stops, torque off.
 
-    A geared joint hangs where its servo, which counts turns from power-up only, can be in one place of its range.
-    `stored`: supply and registers. Raises ConfigError for those of a joint that the head does not have.
+    A servo counts turns only from power-up, so a geared joint hangs where its position in the range is unambiguous.
+    `stored`: supply and registers. Raises ConfigError for registers of a joint that the head does not have.
     """
     for unknown in stored.joints.keys() - head.joints.keys():
         raise ConfigError.at(
@@ -163,7 +163,7 @@ def emulated(head: Head, stored: StoredRegisters = _NEW) -> dict[str, list[Emula
         table = Table.of(load_firmware_map(joint.model))
         angle_rad = sagged_rad(joint, name in sagging)
         found = calibration.zero_ticks[index] + calibration.ticks_per_rad[index] * angle_rad
-        # Not held to the joint's limits, but to what a servo about its middle can read.
+        # Limited not to the joint's range, but to the positions that a servo around its middle can report.
         ticks = round(min(max(found, 0.0), 2.0 * table.center_ticks - 1.0))
         needs = JointNeeds(int(calibration.low_ticks[index]), int(calibration.high_ticks[index]))
         if multi_turn(table, needs):
@@ -177,15 +177,15 @@ def emulated(head: Head, stored: StoredRegisters = _NEW) -> dict[str, list[Emula
 
 
 def plugged_in(head: Head) -> dict[str, list[EmulatedServo]]:
-    """Return the servos of `emulated` with what the head's emulate.yaml says. Raises ConfigError."""
+    """Return the servos of `emulated` with the settings of the head's emulate.yaml. Raises ConfigError."""
     return emulated(head, load_stored(head))
 
 
-# --- where the joints of a head stand that is switched off ----------------------------------------------------------
+# --- joint angles of a head that is switched off --------------------------------------------------------------------
 
 
 def sagging_joints(head: Head) -> frozenset[str]:
-    """Return joints that bear the weight of the head, which falls forward: those that pitch a serial neck."""
+    """Return the joints that bear the weight of the head, which falls forward: those that pitch a serial neck."""
     neck = head.kinematics
     if neck is None or neck.kind != "serial" or "pitch" not in neck.axes:
         return frozenset()

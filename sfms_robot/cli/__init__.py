@@ -1,4 +1,4 @@
-"""The command line. This file comes first and imports next to nothing, so that Ctrl-C is quiet from the start."""
+"""The command line. This file is loaded first and imports almost nothing, so that Ctrl-C is quiet from the start."""
 
 import gc
 import os
@@ -7,9 +7,9 @@ import sys
 
 
 def start() -> None:
-    """Run `sfms-robot`. Ctrl-C while its modules are imported ends the process with exit code 130, without a word."""
+    """Run `sfms-robot`. Ctrl-C while its modules are imported ends the process with exit code 130 and no message."""
     before = signal.signal(signal.SIGINT, lambda *_: os._exit(130))
-    gc.disable()  # all that is imported stays: to look through it for garbage would only delay the command
+    gc.disable()  # imported objects stay: searching them for garbage would only delay the command
     from sfms_robot.cli.main import main
 
     gc.freeze()

@@ -14,7 +14,7 @@ from sfms_robot.cli.train_command import ORDER, Order, interruptible
 app = Typer(help="Evaluate listeners on held-out dyads, and heads on recorded faces.", no_args_is_help=True)
 
 
-Part = Literal["train", "validation", "test"]  # of meetings and voices (`corpora.clips`)
+Part = Literal["train", "validation", "test"]  # parts of meetings and voices (`corpora.clips`)
 Unseen = Literal["validation", "test"]
 LISTENER = Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 SPLIT = Option("test", help="Dyads: test to report, validation to choose.")
@@ -23,7 +23,7 @@ SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
 ENGINE_HELP = "Engine of the listener; its precision is that of its config.yaml."
 _INTERVALS = "in brackets: 95 % intervals over people. Rows of the paper are from other data: compare ratios."
 _ANSWERS = "{participants} people, {answers} answers"
-_TABLES = {  # of the SFMS paper, and where their figures come from
+_TABLES = {  # tables of the SFMS paper, and the tables that their figures come from
     3: "Table 3: where keyframes go",
     4: "Table 4: kinds of codes",
     "3-placements": "Every placement with both inpainters",

@@ -1,4 +1,4 @@
-"""`sfms-robot head`, and `listener|speaker|port list`: what there is, and the tools of a head."""
+"""`sfms-robot head`, and `listener|speaker|port list`: lists of what is available, and the tools of a head."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ def _common(
 
 
 class _Lines(logging.Formatter):
-    """Lines with their level in front; a note is a plain line."""
+    """Log lines with their level in front; a note is a plain line."""
 
     def format(self, record: logging.LogRecord) -> str:
         line = super().format(record)
@@ -93,10 +93,10 @@ class _Lines(logging.Formatter):
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point; leaves by SystemExit.
+    """Run a command, and end with SystemExit.
 
     An error is a line on stderr and an exit code (see `errors`); with --json also one object, the last line of stdout.
-    A command that has printed its own end leaves by typer.Exit, and nothing is added.
+    A command that has printed its own end raises typer.Exit, and nothing is added.
     """
     if _COMPLETION in os.environ:
         app()
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     verbose = [word for word in words if word in ("-v", "--verbose")]
     with _endings_as_interrupts():
         code, problem = _outcome(verbose + _completed([word for word in words if word not in verbose]))
-        # After a command Ctrl-C would replace its exit code by that of a signal.
+        # After a command, Ctrl-C would replace its exit code by that of a signal.
         if arguments is None and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -112,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ended = "interrupted" if code == INTERRUPTED else "failed"
             print_json({"version": 1, "exit": ended, "error": problem, "exit_code": code})
         sys.stdout.flush()
-    except OSError:  # a pipe or disk that takes no more would fail again when the process ends
+    except OSError:  # a closed pipe or a full disk would fail again when the process ends
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
@@ -122,9 +122,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _endings_as_interrupts() -> Iterator[None]:
     """Raise KeyboardInterrupt for SIGTERM and SIGHUP as for Ctrl-C, so that a command closes everything it has opened.
 
-    Not where they are ignored (nohup) or handled, and only in the main thread: Python gives signals to no other.
-    SIGINT is an interrupt also where it is ignored, as for commands that a script starts with `&`: it has to stop a
-    moving head in every phase.
+    Signals that are ignored (nohup) or handled stay so. Main thread only: Python delivers signals to no other thread.
+    SIGINT is an interrupt even if it is ignored, as for commands that a script starts with `&`, because it has to stop
+    a moving head in every phase.
     """
     main_thread = threading.current_thread() is threading.main_thread()
     replaced = {"SIGINT": signal.SIG_IGN, "SIGTERM": signal.SIG_DFL, "SIGHUP": signal.SIG_DFL}
@@ -142,7 +142,7 @@ def _endings_as_interrupts() -> Iterator[None]:
 
 
 def _outcome(words: list[str]) -> tuple[int, str | None]:
-    """Run the command; return its exit code, and the error that was printed on stderr, None without one."""
+    """Run the command; return its exit code, and the error that was printed on stderr, or None."""
     try:
         command = typer.main.get_command(app)
         typed = takewhile(lambda word: not word.startswith("-"), words[:2])
@@ -161,7 +161,7 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
         return _said(error.exit_code, str(error))
     except BrokenPipeError as error:
         return UNEXPECTED, str(error)
-    except OSError as error:  # a file that a flag names, or a full disk behind stdout
+    except OSError as error:  # for a file that a flag names, or for stdout on a full disk
         logging.getLogger(__name__).info("traceback", exc_info=True)
         problem = error.strerror or str(error)
         if error.errno == errno.EMFILE:
@@ -170,7 +170,7 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
             return _said(UNEXPECTED, problem)
         return _said(ConfigError.exit_code, f"{_flagged(str(error.filename), words)}: {problem}")
     except Exception as error:
-        usage = getattr(error, "show", None)  # of an unknown flag or argument
+        usage = getattr(error, "show", None)  # typer's error for an unknown flag or argument
         if usage is None:
             logging.getLogger(__name__).error("internal error, please report it", exc_info=True)
             return _said(UNEXPECTED, f"{type(error).__name__}: {error}")
@@ -180,7 +180,7 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
 
 
 def _completed(words: Sequence[str]) -> list[str]:
-    """Return the words, with a value after each option that may be given without one and is."""
+    """Return the words, with the default value after each option that is given without its optional value."""
     completed = []
     for word, following in zip(words, [*words[1:], "-"], strict=False):
         completed.append(word)
@@ -190,7 +190,7 @@ def _completed(words: Sequence[str]) -> list[str]:
 
 
 def _flagged(path: str, words: Sequence[str]) -> str:
-    """Return the flag and its value where `path` is that value or lies in it, else `path`."""
+    """Return the flag and its value if `path` is that value or lies in it, else `path`."""
     pairs = pairwise(part for word in words for part in word.split("=", 1))
     flags = [(flag, value) for flag, value in pairs if flag.startswith("--") and Path(value).parts]
     return next((f"{flag} {value}" for flag, value in flags if Path(path).is_relative_to(value)), path)

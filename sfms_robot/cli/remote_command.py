@@ -90,7 +90,7 @@ def page(
 
 
 def _show_answers(answers: Sequence[Result], asked: Sequence[str], json: bool) -> None:
-    """Print the answers of heads; exit code 1 when a named head did not answer, or none did."""
+    """Print the answers of heads; exit code 1 if a named head did not answer, or no head did."""
     silent = [name for name in asked if name not in {each.get("name") for each in answers}]
 
     def printed(_: Result) -> None:

@@ -14,7 +14,7 @@ from sfms_robot.data import head_names, listener_names, speaker_names
 from sfms_robot.errors import ConfigError
 
 MAX_SEED = 2**32 - 1  # leaves room in torch's 64 bits for one seed per listener
-DEMO_SEED = 1  # a lively one of the ten that `demo --seeds 10` tries: 7 nods, beside a mean of 4.4
+DEMO_SEED = 1  # a lively one of the ten that `demo --seeds 10` tries: 7 nods; the mean is 4.4
 OF_HEAD = partial(Option, rich_help_panel="Head and servos")
 OF_PERSON = partial(Option, rich_help_panel="Person")
 OF_LISTENER = partial(Option, rich_help_panel="Listener")
@@ -206,7 +206,7 @@ def run(
         show(found, json, heading="{audio}, {seconds} s: " + verdict)
         return
     with ExitStack() as stack:
-        # The listener loads from here on, in its own process, while this one imports the parts that drive a head.
+        # The listener loads in its own process while this process imports the parts that drive a head.
         page = begin_page(view, view_cert, view_key, options=options)
         if page is not None:
             stack.enter_context(closing(page))
@@ -244,7 +244,7 @@ def _print_run(report: Result) -> None:
         "listener": f"{report['listener']}{planned}",
         "limits": f"exceeded {limits['violations']} times; {limits['clamped']} goals were slowed down to stay within",
     }
-    if "writes" in bus:  # not without servos
+    if "writes" in bus:  # missing without servos
         facts["servos"] = (
             f"{bus['writes']} times written, {bus['reads']} times read, {bus['errors']} errors, "
             f"silent: {cell(bus['silent'], 'none')}"

@@ -1,4 +1,4 @@
-"""`sfms-robot servo`: find servos, look into them, change them; `sfms-robot doctor`: look before a run."""
+"""`sfms-robot servo`: find, inspect and change servos; `sfms-robot doctor`: check them before a run."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ YES = Option(False, "--yes", "-y", help="Do not ask before EEPROM is written.")
 
 @dataclass(frozen=True, kw_only=True)
 class Wiring:
-    """Where the servos of a command are. A field is an option of every command."""
+    """Location of the servos of a command. Each field is an option of every command."""
 
     port: str | None = Option(None, help="Serial device, or 'sim'. Default: the only one there is.")
     baud: int | None = Option(None, min=1, help="Look at this rate only. Default: every rate.")
@@ -318,9 +318,9 @@ def factory_reset(
 
 
 def confirmation(yes: bool, ids: str = "") -> Callable[[str], bool]:
-    """Return a function that asks, unless `yes`.
+    """Return a function that asks a question and returns whether the answer is yes; with `yes` it asks nothing.
 
-    With several `ids` one yes holds for the same change to all of them; else each is asked.
+    With several `ids`, one answer holds for the same change to all of them; otherwise each question is asked.
     """
     alike = f" and the same for all of {ids}" if len(ids) > 1 and not ids.isdigit() else ""
     said = [True] if yes else []
@@ -339,7 +339,7 @@ def confirmation(yes: bool, ids: str = "") -> Callable[[str], bool]:
 
 
 def _chosen(wire: Wire, ids: str | None, step: progress.Progress) -> list[FoundServo]:
-    """Return the servos of `ids`, or all. Raises BusError when none answers."""
+    """Return the servos of `ids`, or all servos. Raises BusError if none answers."""
     servos = (
         [wire.find(servo) for servo in single_servo.checked_ids(ids)]
         if ids is not None
@@ -351,7 +351,7 @@ def _chosen(wire: Wire, ids: str | None, step: progress.Progress) -> list[FoundS
 
 
 def _each(ids: str, on: Wiring, key: str, work: Callable[[FoundServo], Sequence[Row]]) -> None:
-    """Do `work` for every id; the rows of the first ids are shown even when a later one fails."""
+    """Call `work` for every id; the rows of the first ids are shown even if a later id fails."""
     rows: list[Row] = []
     servos = single_servo.checked_ids(ids)
     try:

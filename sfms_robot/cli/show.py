@@ -1,4 +1,4 @@
-"""The printer of every command: one JSON object with --json, lines and tables for people without; shared options.
+"""Output of all commands: one JSON object with --json, otherwise lines and tables for people; shared options.
 
 rich is imported when something is printed. Output that is piped keeps whole rows: nothing is cut or folded there.
 """
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-Result = Mapping[str, Any]  # of a command: what --json prints
-Row = Result  # of a table
+Result = Mapping[str, Any]  # result of a command, as --json prints it
+Row = Result  # row of a table
 
 JSON = Option(False, "--json", help="Print the result as one JSON object, the last line of stdout.")
 _UNBROKEN = 1_000  # columns: wider than any table
-_NESTED = 12  # keys of a mapping that is printed inside a table
-_WIDE = 12  # columns; a table with more is turned, a row for each
+_NESTED = 12  # most keys of a mapping that is printed inside a table
+_WIDE = 12  # columns; a table with more is transposed, with a row for each
 _UNPRINTED = ("version", "exit_code", "error")
 _WORDS = {
     "blind": "cannot show",
@@ -50,7 +50,7 @@ _WORDS = {
     "torque_unconfirmed": "torque not confirmed off",
     "voltage_V": "V",
     "whole": "complete",
-}  # keys of results that are printed in other words; of any other key the underscores become spaces
+}  # keys of results that are printed in other words; in any other key underscores become spaces
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def show(
 ) -> None:
     """Print the result of a command, and its `error` to stderr. Raises typer.Exit with its `exit_code`, if not 0.
 
-    `printed` prints it for people; None: `print_report`, which also explains the other arguments.
+    `printed`: function that prints it for people; None: `print_report`, which describes the other arguments.
     """
     if json:
         print_json(result)
@@ -89,7 +89,7 @@ def show(
 
 
 def with_shared_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return `command(shared, ...)` as typer is to see it: the fields of `shared`, a dataclass, are options too."""
+    """Return `command(shared, ...)` with a signature for typer: fields of `shared`, a dataclass, are options too."""
     first, *own = inspect.signature(command, eval_str=True).parameters.values()
     shared = inspect.signature(first.annotation, eval_str=True).parameters.values()
 
@@ -98,7 +98,7 @@ def with_shared_options(command: Callable[..., None]) -> Callable[..., None]:
         command(first.annotation(**{each.name: given.pop(each.name) for each in shared}), **given)
 
     seen = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in (*own, *shared)]
-    run.__dict__.pop("__wrapped__")  # or its signature would be looked at instead
+    run.__dict__.pop("__wrapped__")  # or typer would use the signature of `command`
     run.__dict__["__signature__"] = inspect.Signature(seen)
     run.__annotations__ = {each.name: each.annotation for each in seen}
     return run
@@ -107,7 +107,7 @@ def with_shared_options(command: Callable[..., None]) -> Callable[..., None]:
 def print_report(result: Result, heading: str = "", keys: Sequence[str] = (), note: str = "") -> None:
     """Print a heading, the values of `keys` (default: all), and a note.
 
-    A value is a line, or a table where it is a list of rows or a mapping of names to rows. Heading and note may hold
+    A value is a line, or a table if it is a list of rows or a mapping of names to rows. Heading and note may contain
     values, as in "{head} on {port}", which are then not printed again.
     """
     texts = defaultdict(lambda: "-", {key: cell(value) for key, value in result.items()})
@@ -139,7 +139,7 @@ def _finite(value: Any) -> Any:
 
 
 def screen() -> Console:
-    """Return standard output, as wide as the terminal; of unlimited width where it is not one."""
+    """Return standard output, as wide as the terminal; of unlimited width if it is not a terminal."""
     from rich.console import Console
 
     console = Console(highlight=False)
@@ -149,7 +149,7 @@ def screen() -> Console:
 
 
 def aside(line: str) -> None:
-    """Print one line to stderr, beside the result."""
+    """Print one line to stderr, apart from the result."""
     print(line, file=sys.stderr, flush=True)
 
 
@@ -169,8 +169,8 @@ def print_rows(rows: Sequence[Row], title: str = "") -> None:
 def table_of(rows: Sequence[Row]) -> Table:
     """Return rows as a table: a column for each key that is not empty in all of them.
 
-    A key `interval` of figures by name is printed behind these figures. A mapping with more than `_NESTED` keys is left
-    to --json. A table of more than `_WIDE` columns and few rows is turned: a line for each key.
+    A key `interval` of figures by name is printed after these figures. A mapping with more than `_NESTED` keys is only
+    in --json. A table of more than `_WIDE` columns and few rows is transposed: a line for each key.
     """
     from rich import box
     from rich.table import Table
@@ -209,7 +209,7 @@ def _with_intervals(row: Row) -> Row:
 def cell(value: object, missing: str = "-") -> str:
     """Return a value as text: "yes" or "no", a float in four digits or three decimals, "a 1, b 2" for a mapping.
 
-    `missing` for None and NaN, and for what is empty. A list is "a, b".
+    `missing` for None, NaN and empty values. A list is "a, b".
     """
     if isinstance(value, Mapping):
         return ", ".join(f"{key} {_nested(each)}" for key, each in value.items()) or missing

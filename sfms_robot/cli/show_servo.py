@@ -22,12 +22,12 @@ _COLUMNS = (
     "return_delay_us",
     "torque",
     "faults",
-)  # of the servos of a bus
+)  # columns of the table of a bus's servos
 _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 
 def live(samples: Iterable[Sequence[Row]], title: str) -> None:
-    """Show one table, redrawn with every sample, until they end or Ctrl-C is pressed."""
+    """Show one table, redrawn with every sample, until the samples end or Ctrl-C is pressed."""
     console = screen()
     rows: Sequence[Row] = []
     try:

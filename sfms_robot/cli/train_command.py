@@ -25,7 +25,7 @@ else:
 app = Typer(help="Train a listener: its tokenizer, its predictor; and when it does what.", no_args_is_help=True)
 data_app = Typer(help="Training data: compose dyads, check and convert data sets.", no_args_is_help=True)
 
-_SHOWN = 3  # names of a problem; --json has them all
+_SHOWN = 3  # names shown for a problem; --json has them all
 
 
 Order = Literal["exp-first", "pose-first"]
@@ -43,7 +43,7 @@ LAYOUT = Option(
 
 @dataclass(frozen=True, kw_only=True)
 class PhaseFlags:
-    """Options of both phases of training. A field is an option of each."""
+    """Options of both phases of training. Each field is an option of both."""
 
     config: Path = CONFIG
     data: Path | None = Option(
@@ -119,7 +119,7 @@ def _train(work: Callable[[train_runs.TrainOptions], Report], flags: PhaseFlags,
         scratch=flags.scratch,
     )
     figures = interruptible(lambda: work(options))
-    if not figures:  # of a process that is not the first of its group
+    if not figures:  # in a process that is not the first of its group
         return
     if figures["resumed_at"] == figures["steps"]:
         aside(f"sfms-robot: had already finished at step {figures['steps']}")
@@ -246,7 +246,7 @@ def _print_conversion(report: Result) -> None:
 
 
 def _print_data(report: Result, channels: bool) -> None:
-    """Print splits, their problems, and if wanted the range of every channel."""
+    """Print splits, their problems, and with `channels` the range of every channel."""
     order = f", {report['order']}" if report["order"] else ""
     splits, first = report["splits"], report["splits"][0]
     say(f"{'usable' if report['usable'] else 'not usable'}: {report['folder']}", "bold")

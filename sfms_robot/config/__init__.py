@@ -1,4 +1,4 @@
-"""Frozen, validated models of every YAML file, and the loader that names file, key, value and valid choices."""
+"""Frozen, validated models of every YAML file, and the loader, whose errors name file, key, value and valid choices."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -110,7 +110,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Load a name of `config.training` when it is first used: only the lab needs them (PEP 562)."""
+    """Load a name of `config.training` when it is first used, because only the lab needs them (PEP 562)."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.training"), name)

@@ -1,11 +1,11 @@
 """YAML files as frozen, strict models, with errors of one line that name file, key, value and valid choices.
 
-Files use the units that people use (degrees, milliseconds where the key says so); properties give radians and seconds.
-Code past `load` handles no plain dict.
+Files use the units that people use (degrees, milliseconds where the key says so); properties return radians and
+seconds. Code after `load` never handles a plain dict.
 
 Scalars are those of YAML 1.2's core schema. YAML 1.1, the default of pyyaml, reads `yes`, `on` and `no` as booleans,
 `023` as 19 and `1:30` as 90. Here only `true` and `false` are booleans, and a number with a leading zero is refused,
-because readers do not agree on it.
+because YAML readers disagree about it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, InputError, did_you_mean, not_one_of
 
-DEEPEST: Final = 100  # levels; libyaml's composer recurses, and ends the process at some 10,000
+DEEPEST: Final = 100  # levels; libyaml's composer is recursive, and ends the process at some 10,000 levels
 _LEADING_ZERO: Final = "!leading-zero"
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -63,11 +63,11 @@ class Model(BaseModel):
         """Report unknown keys with the known ones, and then the other problems of the section."""
         found = []
         for key, given in value.items() if isinstance(value, dict) else ():
-            if isinstance(key, (int, float)) and given is None:  # of 25,5 in a list of keys
+            if isinstance(key, (int, float)) and given is None:  # from 25,5 in a list of keys
                 found.append(f"{key} stands alone, without a key: a decimal number is written with a point, as 25.5")
             elif key not in cls.model_fields:
                 found.append(not_one_of(key, "a known key", cls.model_fields))
-            # Python takes true for 1: `id: true` would be servo 1.
+            # In Python true equals 1: `id: true` would be servo 1.
             elif isinstance(given, bool) and not _takes_bool(cls.model_fields[key].annotation):
                 found.append(f"{key} = {str(given).lower()} is neither a number nor a name")
         if not found:
@@ -116,7 +116,7 @@ def load(model: type[M], file: Path) -> M:
 
 
 def parse(model: type[M], raw: object, file: Path | str) -> M:
-    """Validate plain data as `model`; `file` is the name that the ConfigError begins with."""
+    """Validate plain data as `model`; a ConfigError begins with the name `file`."""
     try:
         return model.model_validate(raw)
     except ValidationError as error:
@@ -130,7 +130,7 @@ def one_line(problem: ErrorDetails) -> str:
     key = ".".join(map(str, problem["loc"]))
     text = problem["msg"].removeprefix("Value error, ")
     value = problem["input"]
-    if problem["type"] in ("model_type", "dict_type"):  # pydantic names the class
+    if problem["type"] in ("model_type", "dict_type"):  # pydantic's text names the class
         text = "expected keys with values, as key: value"
         text += ", got a list: leave out the dashes" if isinstance(value, list) else ""
     elif problem["type"] == "literal_error":
@@ -214,7 +214,7 @@ def read(file: Path) -> Any:
 def with_number(text: str, keys: Sequence[str], value: int) -> str:
     """Return `text` with `value` under a path of mapping keys; comments, order and all other values stay.
 
-    Edits only the text: aliases and merge keys are not followed, so the caller checks the meaning of the result.
+    Edits only the text: aliases and merge keys are not followed, so the caller has to check the meaning of the result.
     """
     node: Any = yaml.compose(text, Loader=yaml.SafeLoader)
     missing, new = list(keys), f"{value}"
@@ -224,7 +224,7 @@ def with_number(text: str, keys: Sequence[str], value: int) -> str:
     for key in reversed(missing):
         new = f"{{{key}: {new}}}"
     start, end = node.start_mark.index, node.end_mark.index
-    if isinstance(node, yaml.MappingNode):  # as its first entry
+    if isinstance(node, yaml.MappingNode):  # becomes its first entry
         start = end = start + node.flow_style
         new = new[1:-1] + (", " if node.flow_style else f"\n{' ' * node.start_mark.column}")
     return text[:start] + new + text[end:]

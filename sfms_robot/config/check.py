@@ -1,7 +1,7 @@
-"""All problems of a head's file at once, where `load_head` names the first one.
+"""All problems of a head's file at once; `load_head` reports only the first one.
 
-Keys and values that are wrong by themselves come first; contradictions between the parts are looked for once there are
-none. The registers that a file may write into a servo, or expect to find stored there, are judged by its firmware map.
+Wrong keys and values come first; contradictions between the parts are searched for only if there are none. The
+registers that a file may write into a servo, or expect to find stored there, are checked with its firmware map.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from sfms_robot.config.overlay import load_overlay
 from sfms_robot.data import head_file
 from sfms_robot.errors import ConfigError
 
-_SMALL_DEG: Final = 6.3  # of a joint in radians: a whole turn would be 6.28
+_SMALL_DEG: Final = 6.3  # a smaller range may be given in radians, where a whole turn is 6.28
 _HARMLESS: Final = re.compile(r"(\w+_)?gain|profile_\w+|acceleration|punch|led|c?cw_compliance_(margin|slope)")
 
 
 def check_head(name: str) -> list[str]:
     """Return the problems of a head, by shipped name or folder, one line each with file, key, value and choices.
 
-    For a sound head the overlay of this build is checked too. Raises ConfigError where there is no such head.
+    For a head without problems the overlay of this build is checked too. Raises ConfigError if there is no such head.
     """
     file = head_file(name)
     try:
@@ -42,7 +42,7 @@ def check_head(name: str) -> list[str]:
 
 
 def _servos(head: Head) -> Problems:
-    """Yield the servos without a firmware map or of another family than their bus, and what a run must not write."""
+    """Yield servos without a firmware map or of another family than their bus, and register values that are refused."""
     for name, joint in head.joints.items():
         try:
             table = load_firmware_map(joint.model)
@@ -60,7 +60,7 @@ def _servos(head: Head) -> Problems:
 
 
 def remarks(head: Head) -> list[str]:
-    """Return what is allowed in a head and probably not meant, one line each."""
+    """Return one line for each value of a head that is allowed but probably a mistake."""
     found = []
     for name, joint in head.joints.items():
         low, high, fastest = joint.min_deg, joint.max_deg, load_firmware_map(joint.model).no_load_speed_deg_s
@@ -74,12 +74,12 @@ def remarks(head: Head) -> list[str]:
 
 
 def is_harmless(table: FirmwareMap, name: str) -> bool:
-    """Return whether a run may write this register unasked: one in RAM that cannot hurt.
+    """Return whether a run may write this register without a question: it is in RAM and harmless.
 
-    `safety.registers` is written before torque comes on, in every run, without a question. So it holds only values
-    that are lost with the supply and cannot hurt: gains, profiles, compliance, LED. Id, direction and range are stored
-    for good; a head may list under `safety.stored` the values that it expects, and a run compares and never writes
-    them. Goals, torque, modes and limits are the run's own.
+    `safety.registers` is written before torque comes on, in every run, without a question. It therefore holds only
+    values that are lost when the supply is switched off and are harmless: gains, profiles, compliance, LED. Id,
+    direction and range are stored permanently; a head may list under `safety.stored` the values that it expects, and a
+    run compares them but never writes them. Goals, torque, modes and limits are set by the run itself.
     """
     register = table.registers[name]
     return register.access == "RW" and register.area == "RAM" and _HARMLESS.fullmatch(name) is not None

@@ -24,7 +24,7 @@ def problems(head: Any) -> list[str]:
 
 
 def _wiring(head: Any) -> Problems:
-    """Yield the joints that are on no bus, of no limit class, or on another's id."""
+    """Yield joints with an unknown bus or limit class, or with the id of another joint of their bus."""
     seen: dict[tuple[str, int], str] = {}
     for name, joint in head.joints.items():
         if joint.bus not in head.buses:
@@ -37,9 +37,9 @@ def _wiring(head: Any) -> Problems:
 
 
 def highest_rate_hz(family: str, baud: int, joints: int) -> float:
-    """Return how often a second goals for `joints` servos fit on a wire of `baud`, answers left out.
+    """Return how often per second goals for `joints` servos fit on a wire of `baud`, without answers.
 
-    At most 1000, and whole. A board sends the changes when its wire is free, so its wire sets no limit.
+    A whole number, at most 1000. A board sends the changes when its wire is free, so its wire sets no limit.
     """
     framing = FRAMINGS.get(family)
     if framing is None or not framing.answer:
@@ -48,7 +48,7 @@ def highest_rate_hz(family: str, baud: int, joints: int) -> float:
 
 
 def _rates(head: Any) -> Problems:
-    """Yield the buses whose packets, or whose wire at `rate_hz`, cannot carry the goals of their joints."""
+    """Yield buses whose packets, or whose wire at `rate_hz`, cannot carry the goals of their joints."""
     for name, bus in head.buses.items():
         count = len(head.on_bus(name))
         framing = FRAMINGS.get(bus.family)  # None for a family of another package
@@ -79,13 +79,13 @@ def _drives(head: Any) -> Problems:
     for name, joint in head.joints.items():
         if (twin := joint.mirror_of) is None:
             continue
-        other = head.joints[twin]  # `head.expanded` has looked for it
+        other = head.joints[twin]  # `head.expanded` has checked that it exists
         if twin == name or other.mirror_of is not None:
             yield f"joints.{name}.mirror_of = {twin!r} is itself a mirror; name the joint that has the drive"
         elif other.unit != joint.unit:
             yield f"joints.{name}.unit = {joint.unit!r} is not that of {twin} ({other.unit})"
     uses = {name: {node.use for node in tree.nodes() if node.use} for name, tree in head.expressions.items()}
-    sizes: dict[str | None, int] = {}  # of shared expressions, those that they use in their places
+    sizes: dict[str | None, int] = {}  # nodes of shared expressions, with those of the expressions that they use
     try:
         for used in TopologicalSorter(uses).static_order():
             sizes[used] = _size(head.expressions[used], sizes) if used in head.expressions else 0
@@ -147,7 +147,7 @@ def _neck(head: Any) -> Problems:
 
 
 def _description(head: Any) -> Problems:
-    """Yield the joints of the URDF section that the head lacks, and joints of the URDF that two of ours would move."""
+    """Yield the joints of the URDF section that the head lacks, and URDF joints that two of its joints would move."""
     if head.urdf is None:
         return
     owner: dict[str, str] = {}

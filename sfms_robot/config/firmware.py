@@ -1,8 +1,8 @@
 """A servo model's control table as data, one YAML file per model.
 
-A file is refused when its registers overlap, do not fit their size, or a role names a register that is not there, so
-that code past the loader need not check. A model whose table changed with its firmware
-has one file per layout (`xl330-m288.yaml`, `xl330-m288_fw52.yaml`): `variant` picks by the number read from the servo.
+A file is refused if its registers overlap or do not fit their size, or if a role names a register that does not exist,
+so that code after the loader need not check. A model whose table changed with its firmware has one file per layout
+(`xl330-m288.yaml`, `xl330-m288_fw52.yaml`): `variant` chooses the layout by the number read from the servo.
 """
 
 from __future__ import annotations
@@ -134,13 +134,13 @@ class FirmwareMap(Model):
     protocol: Literal[1, 2] | None = None
     byte_order: Literal["little", "big"] = "little"
     firmware: FirmwareRange = FirmwareRange()
-    variant_of: str | None = None  # the model this is another firmware's layout of
-    same_number_as: str | None = None  # a model that the number alone cannot tell from this one
+    variant_of: str | None = None  # the model of which this is the layout of another firmware
+    same_number_as: str | None = None  # a model with the same number
     source: str = Field(min_length=1)
     ticks_per_revolution: Positive
     center_ticks: int
     no_load_speed_deg_s: Positive | None = None  # None: not known
-    watchdog: Literal["stops", "flags_only", "none"] = "none"  # what the servo does when its host falls silent
+    watchdog: Literal["stops", "flags_only", "none"] = "none"  # reaction of the servo to a silent host
     position_mode: int | None = None  # value of role operating_mode for position control
     baud_codes: dict[int, PositiveInt] = {}  # code in role baud_rate -> bit/s
     faults: dict[Bit, str] = {}  # bit of role error_status, or of a board's error word
@@ -148,7 +148,7 @@ class FirmwareMap(Model):
     channels: int | None = Field(default=None, gt=0, le=255)
     pulse_us: PulseRange | None = None
     tick_us: Positive | None = None
-    roles: dict[Role, Name | None] = {}  # where the register's name is not the role's own
+    roles: dict[Role, Name | None] = {}  # registers whose name is not that of their role
     registers: dict[Name, Register] = {}
 
     def contradictions(self) -> Problems:
@@ -183,7 +183,7 @@ class FirmwareMap(Model):
             if register.end > space:
                 yield f"registers.{name}.address = {register.address} ends past the address space ({space} bytes)"
             if wide and register.size > 1 and register.address % 2:
-                # Tables with 4-byte registers are read as words inside the servo: an odd address is a slip.
+                # Tables with 4-byte registers are read as words inside the servo: an odd address is a mistake.
                 yield f"registers.{name}.address = {register.address} is odd, which {register.size} bytes cannot be"
             yield from (f"registers.{name}.{problem}" for problem in register.problems())
             end, last = max(end, register.end), name
@@ -209,7 +209,7 @@ def map_files() -> list[Path]:
 
 
 def model_name(text: str) -> str:
-    """Return a servo's model as its map is called: in lower case, without the -T or -R of its connector."""
+    """Return the name of a servo model's map: in lower case, without the -T or -R of its connector."""
     name = text.lower()
     return text if name.endswith(".yaml") else name if name.endswith("-1.0") else re.sub("-[tr]$", "", name)
 
@@ -218,7 +218,7 @@ def model_name(text: str) -> str:
 def load_firmware_map(model: str) -> FirmwareMap:
     """Return a servo's control table by model name, or by the path of a `.yaml` file.
 
-    Raises ConfigError for a model that has none, listing those that have one, or that has two.
+    Raises ConfigError for a model without a map, listing the models with one, and for a model with two maps.
     """
     if model.endswith(".yaml"):
         return load(FirmwareMap, Path(model))
@@ -234,7 +234,7 @@ def load_firmware_map(model: str) -> FirmwareMap:
 def variant(model: str | FirmwareMap, firmware: int) -> FirmwareMap:
     """Return the layout of `model` for the firmware number read from the servo.
 
-    Raises ConfigError when there is none, naming those available.
+    Raises ConfigError, which lists the available layouts, if there is none.
     """
     named = load_firmware_map(model) if isinstance(model, str) else model
     if named.firmware.min <= firmware <= named.firmware.max:

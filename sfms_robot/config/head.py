@@ -29,9 +29,9 @@ from sfms_robot.errors import not_one_of
 from sfms_robot.frames import LATERAL_POSE, Doubles
 from sfms_robot.ranges import Range
 
-VERSION: Final = 1  # of a head's file
-NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # keys that a twin does not take over
-TRAVEL: Final = 0.2  # of a joint that is to be calibrated first, around rest
+VERSION: Final = 1  # version of the format of a head's file
+NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # keys not taken over from a twin
+TRAVEL: Final = 0.2  # share of the travel, around rest, of a joint that must be calibrated first
 PACE: Final = 0.3
 _SUFFIX: Final = "_calibrate_first"
 
@@ -217,7 +217,7 @@ class Head(Model):
 def load_head(name: str, *, servos: bool = True) -> Head:
     """Return a head by shipped name or folder. Raises ConfigError.
 
-    `servos` False: also the one without any, `NO_HEAD`.
+    `servos` False: accept also `NO_HEAD`, a head without servos.
     """
     if name == NO_HEAD and not servos:
         return Head.model_construct(name=NO_HEAD, description="No servos", buses={}, limits={}, joints={})
@@ -234,8 +234,8 @@ def expanded(raw: Any) -> Any:
     roll, yaw and y, which have one channel for both sides, change sign. A joint whose plus points to the same side of
     the head as that of its twin (pan, say) is of the opposite sense: its drive, and its range, are negated as well.
 
-    A value of the wrong type stays unchanged, for the models to refuse. Raises ValueError for a newer version, and for
-    a twin that is not there.
+    A value of the wrong type stays unchanged, and the models refuse it. Raises ValueError for a newer version, and for
+    a twin that does not exist.
     """
     if not isinstance(raw, dict):
         return raw
@@ -283,12 +283,12 @@ def held_back(head: Head, joints: Iterable[str]) -> Head:
     return head.replaced(limits=limits, joints=held)
 
 
-# --- Drives: every joint's own as one plain expression, with sharing, mirrors and folds worked out ------------------
+# --- Drives: one plain expression for each joint, with sharing, mirrors and folds worked out ------------------------
 
 
 def drives(head: Head) -> dict[str, Expression | None]:
-    """Return the drive of every joint in terms of channels alone; None for a joint without one."""
-    # A mirror that has learnt a drive of its own does not look at its twin's.
+    """Return the drive of every joint in terms of channels alone; None for a joint without a drive."""
+    # A mirror with a learnt drive of its own does not use the drive of its twin.
     mirrors = {name for name, joint in head.joints.items() if joint.mirror_of is not None and joint.drive is None}
     found = {name: _own(name, joint.drive, head) for name, joint in head.joints.items() if name not in mirrors}
     for name in mirrors:
@@ -308,7 +308,7 @@ def _own(name: str, drive: Expression | None, head: Head) -> Expression | None:
 
 
 def _inlined(node: Expression, expressions: Mapping[str, Expression]) -> Expression:
-    """Return the expression with every shared one in the place of its name."""
+    """Return the expression with every shared expression in place of its name."""
     if node.use is not None:
         shared = _inlined(expressions[node.use], expressions)
         return shared if node == Expression(use=node.use) else node.replaced(use=None, sum=(shared,))

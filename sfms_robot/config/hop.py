@@ -2,15 +2,16 @@
 
 A sound comes at any time within a hop, and reaches the goals after
 
-    0 .. hop T      until the frame ends that is planned with
-    source          until that frame is whole, and the next tick gives it to the listener
-    step            until the plan is made, and the next tick's goals are the first of it
-    T               more where a plan is a single frame, which is played one frame late (`motion.timeline`)
+    0 .. hop T      until the end of the frame with which the next plan is made
+    source          until that frame is complete, and the next tick passes it to the listener
+    step            until the plan is made, and the next tick has the first goals of it
+    T               more if a plan is a single frame, which is played one frame late (`motion.timeline`)
 
-Half of all sounds come in the later half of a hop: that is p50, and p95 are 0.95 of it.
+Half of all sounds come in the later half of a hop, so p50 is the time of a sound 0.5 hop T before its end, and p95 of
+one 0.95 hop T before its end.
 
-A plan of H frames is followed until the next one is there, which is hop T + source + step after its own last speaker
-frame. What it still knows by then, of (H - 1) T, is left for leads. (A single frame that is played late knows T.)
+A plan of H frames is followed until the next one is ready, which is hop T + source + step after its own last speaker
+frame. The part of its (H - 1) T that is left by then is available for leads. (A single frame played late has T.)
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from typing import Final
 
 from sfms_robot.frames import FRAME_S
 
-STEP_S: Final = 0.025  # what one plan may take at most (99th percentile, paper size, two CPU cores)
-LEAD_S: Final = 0.080  # longest lead of a joint: the otherwise servo's lag and a tick
-P50_S: Final = 0.095  # wanted from a sound to the first goal of a plan that knows of it
+STEP_S: Final = 0.025  # longest computation of a plan (99th percentile, paper size, two CPU cores)
+LEAD_S: Final = 0.080  # longest lead of a joint: the slowest servo's lag and a tick
+P50_S: Final = 0.095  # wanted time from a sound to the first goal of a plan made with it
 P95_S: Final = 0.135
 _EPS_S: Final = 1e-9
 
@@ -46,9 +47,9 @@ class Latencies:
 
     Attributes:
         horizon: frames of a plan, H.
-        source_s: from the end of a frame to the moment that it is whole.
-        step_p50_s, step_p99_s: of a plan.
-        lead_s: the longest that a joint asks for.
+        source_s: time from the end of a frame until it is complete.
+        step_p50_s, step_p99_s: time to make a plan.
+        lead_s: longest lead of a joint.
         tick_s: period of the servo loop.
     """
 
@@ -60,7 +61,7 @@ class Latencies:
     tick_s: float
 
     def goal_s(self, hop: int, share: float, step_s: float) -> float:
-        """Return the time from a sound, `share` of a hop before its end, to the first goal of a plan with it."""
+        """Return the time from a sound, `share` of a hop before the hop's end, to the first goal of a plan with it."""
         given_s = _next_tick(self.source_s, self.tick_s)
         played_late_s = FRAME_S if self.horizon == 1 else 0.0
         return share * hop * FRAME_S + _next_tick(given_s + step_s, self.tick_s) + played_late_s
@@ -72,7 +73,7 @@ class Latencies:
         return self.goal_s(hop, 0.95, self.step_p99_s)
 
     def left_s(self, hop: int) -> float:
-        """Return the time left of a plan when the next one comes; below 0: it has run out by then."""
+        """Return the time left of a plan when the next one comes; negative if it has run out by then."""
         return (max(self.horizon - 1, 1) - hop) * FRAME_S - self.source_s - self.step_p99_s
 
     def fits(self, hop: int) -> bool:
@@ -98,16 +99,16 @@ class Latencies:
         return lost
 
     def keeps_up(self, hop: int) -> bool:
-        """Return whether a plan mostly takes half of its hop at most, and hardly ever all of it.
+        """Return whether a plan takes at most half of its hop (median), and at most all of it (99th percentile).
 
-        The rest is for catching up with the sound that came while graphs were built.
+        The rest of the time is for catching up with the sound that came while graphs were built.
         """
         return self.step_p50_s <= hop * FRAME_S / 2 and self.step_p99_s <= hop * FRAME_S
 
 
 @dataclass(frozen=True)
 class HopChoice:
-    """A hop, its time budget, and a text about the parts that did not fit; None: all did."""
+    """A hop, its time budget, and a text about the parts that do not fit; None if all fit."""
 
     hop: int
     budget_ms: dict[str, float]
@@ -125,7 +126,7 @@ def default_hop(horizon: int) -> int:
 def choose_hop(hops: Sequence[int], measured: Latencies) -> HopChoice:
     """Return the largest of `hops` (at least one) that fits, else the smallest with which the listener keeps up.
 
-    Of all that do not fit the smallest gives up least.
+    Of the hops that do not fit, the smallest gives up least.
     """
     fitting = [hop for hop in hops if measured.fits(hop)]
     otherwise = min((hop for hop in hops if measured.keeps_up(hop)), default=max(hops))

@@ -24,7 +24,7 @@ from sfms_robot.plugins import plugins
 GROUPS: Final = ("sum", "max", "min", "mean", "product")
 KINDS: Final = ("channel", "use", *GROUPS)
 MOST_FACTORS: Final = 4
-SMALLEST_STEP: Final = 1e-6  # of a curve's x
+SMALLEST_STEP: Final = 1e-6  # between two x of a curve
 BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
 BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
 
@@ -121,7 +121,7 @@ class Coupling(Model):
     """
 
     keep: dict[Name, Gain] = Field(min_length=2)
-    at_least: float = Field(le=0, ge=-1000)  # at rest the sum is 0: rest has to be allowed
+    at_least: float = Field(le=0, ge=-1000)  # at rest the sum is 0, and rest must be allowed
     moving: tuple[Name, ...] = Field(min_length=1)
 
     def contradictions(self) -> Problems:
@@ -247,7 +247,7 @@ class Joint(Model):
     drive: Expression | None = None
     mirror_of: Name | None = None
     mirror_sense: Literal["same", "opposite"] = "same"
-    safety: Safety | None = None  # over that of the head
+    safety: Safety | None = None  # overrides that of the head
     note: str = ""
 
     def contradictions(self) -> Problems:

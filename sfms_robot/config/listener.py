@@ -1,4 +1,4 @@
-"""A listener: the settings in its folder's config.yaml, and how often it does things."""
+"""Settings of a listener, from the config.yaml in its folder, and how often it makes each kind of event."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Placement = Literal["exact", "penalised", "static", "static_paper", "learned_pap
 GAZE_CHANNELS: Final = tuple(name for name in BLENDSHAPES if name.startswith("eyeLook"))
 # Conversational states of ARIG (3.3), in the order of the model's classes.
 STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
-# Those of a listener with events: visible feedback, by its kind, apart from audible feedback.
+# States of a listener with events: visible feedback, by its kind, is separate from audible feedback.
 EVENT_STATES: Final = (*STATES, "giving_feedback_nod", "giving_feedback_smile")
 
 
@@ -133,7 +133,7 @@ class Sampling(Model):
 
 
 def uneven_heads(heads: int, **widths: int) -> Problems:
-    """Yield the problem of each width, by its key, that cannot be cut into `heads` heads of even width."""
+    """Yield the problem of each width, named by its key, that cannot be divided into `heads` heads of even width."""
     for key, width in widths.items():
         if width % (2 * heads):
             yield f"{key} {width} is not a multiple of twice heads ({heads})"
@@ -327,7 +327,7 @@ def _both(value: Any) -> Any:
     return (value, value) if isinstance(value, int | float) else value
 
 
-Temperature = Annotated[tuple[NonNegative, NonNegative], BeforeValidator(_both)]  # first and last; one number is both
+Temperature = Annotated[tuple[NonNegative, NonNegative], BeforeValidator(_both)]  # first and last; one number: both
 
 
 class Diffusion(Model):
@@ -424,7 +424,7 @@ class Arig(ListenerSettings):
         return EVENT_STATES if self.events else STATES
 
 
-# The models of config.yaml of each kind of listener that a folder may hold; for listeners of other packages see
+# The model of config.yaml for each kind of listener that a folder may contain; for listeners of other packages see
 # `plugins`.
 LISTENER_KINDS: Final[Mapping[str, type[ListenerSettings]]] = {"sfms": Sfms, "arig": Arig}
 

@@ -1,13 +1,13 @@
-"""Measurements of one built head, laid over its shipped file: `heads/NAME.yaml` in the user's folder.
+"""Measurements of one built head, applied on top of its shipped file: `heads/NAME.yaml` in the user's folder.
 
-Two builds of a head differ in their zeros, ranges and directions, and in how their skin answers. These differences are
+Two builds of a head differ in their zeros, ranges and directions, and in how their skin responds. These differences are
 kept apart from the shipped file, in layers that are applied in this order:
 
     head file -> calibrate (zero, ends and direction of each joint) -> stored (registers of a servo, as confirmed)
               -> fit (drives learnt from sight)
 
-A measurement holds for the servo and the head file that it was made with. Where one of them has changed since, the
-joint counts as not calibrated.
+A measurement holds for the servo and the head file that it was made with. If one of them has changed since, the joint
+counts as not calibrated.
 """
 
 from __future__ import annotations
@@ -138,11 +138,11 @@ class Overlay(Model):
 
 @dataclass(frozen=True, kw_only=True)
 class Layered:
-    """A head with its overlay on.
+    """A head with its overlay applied.
 
     Attributes:
         calibrated: joints whose measurement holds.
-        refused: joint -> why its measurement does not hold.
+        refused: joint -> reason why its measurement does not hold.
         fitted: joints with a learnt drive.
         notes: one line for each layer that is not used at all.
     """
@@ -165,7 +165,7 @@ def head_hash(name: str) -> str:
 
 
 def load_overlay(head: Head, file: Path | None = None) -> Overlay:
-    """Return a head's overlay, empty without a file. Raises ConfigError for another head's, or for unknown joints."""
+    """Return a head's overlay, empty without a file. Raises ConfigError for that of another head, or unknown joints."""
     file = file or overlay_file(head.name)
     if not file.is_file():
         return Overlay(head=head.name)
@@ -181,7 +181,7 @@ def load_overlay(head: Head, file: Path | None = None) -> Overlay:
 
 
 def check_writable(file: Path) -> Path:
-    """Return the file of an overlay, its folder made. Raises ConfigError where it cannot be written, now not later."""
+    """Return the file of an overlay after making its folder. Raises ConfigError at once if it cannot be written."""
     write_whole(probe := file.with_name(f".{file.name}.try"), "")
     probe.unlink()
     return file
@@ -195,13 +195,13 @@ def save_overlay(overlay: Overlay, file: Path) -> None:
 
 
 def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Identity | None] | None = None) -> Layered:
-    """Lay all layers over a head.
+    """Apply all layers to a head.
 
     Args:
-        sha256: of the head's file now.
-        servos: the servo that answers at each joint, or None; without it only the file is compared.
+        sha256: hash of the head's present file.
+        servos: the servo that answers at each joint, or None; without `servos` only the file is compared.
 
-    Raises ConfigError for a layer that makes no sound head.
+    Raises ConfigError for a layer that contradicts other parts of the head.
     """
     joints, refused, notes = dict(head.joints), dict[str, str](), list[str]()
     for name, found in overlay.measured.items():
@@ -238,7 +238,7 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
 
 
 def calibrated(joint: Joint, found: Measured, usual: Safety) -> Joint:
-    """Return the joint with measured zero, direction and ends; its rest keeps its angle, at the measured centre.
+    """Return the joint with measured zero, direction and ends; its rest angle is kept and lies at the measured centre.
 
     `usual`: safety of the head, which that of the joint overrides.
     """
@@ -251,7 +251,7 @@ def calibrated(joint: Joint, found: Measured, usual: Safety) -> Joint:
 
 
 def declared(joint: Joint, stored: Mapping[str, int], usual: Safety) -> Joint:
-    """Return the joint with zero and direction that count as made for these registers of its servo."""
+    """Return the joint with `stored` added to the register values that its servo has to store."""
     stored = {**usual.merged(joint.safety).stored, **stored}
     return joint.replaced(safety=(joint.safety or Safety()).replaced(stored=stored))
 
@@ -259,9 +259,9 @@ def declared(joint: Joint, stored: Mapping[str, int], usual: Safety) -> Joint:
 def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bool = False) -> Path:
     """Record in the file of head `name` the registers that the servo of a joint stores; return the file written.
 
-    The head.yaml of the user is edited. The overlay is written instead for a shipped head, for one that has an overlay
-    (an edit would end its measurements), for a file that cannot be written, and for one whose form (an alias, a twin)
-    does not let one joint change alone.
+    The head.yaml of the user is edited. The overlay is written instead for a shipped head, for a head that has an
+    overlay (an edit would invalidate its measurements), for a file that cannot be written, and for a file whose form
+    (an alias, a twin) does not allow a change of one joint alone.
     `practice`: found on emulated servos. Raises ConfigError for a file that cannot be written.
     """
     head = load_head(name)
@@ -284,13 +284,13 @@ def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bo
 # --- Origin of each value: its own line, its twin, the head's defaults, or nowhere; then this build -------------------
 
 SHOWN: Final = tuple(key for key in Joint.model_fields if key not in ("mirror_of", "mirror_sense", "safety", "note"))
-MEASURED: Final = ("zero_ticks", "sign", "min_deg", "max_deg")  # given by a calibration
+MEASURED: Final = ("zero_ticks", "sign", "min_deg", "max_deg")  # set by a calibration
 
 
 def provenance(name: str) -> tuple[dict[str, dict[str, tuple[Any, str]]], list[str]]:
     """Return the value and its origin per joint and key; and a line for each measurement and fit that does not hold.
 
-    Measurements count here whichever servos are plugged in now. Raises ConfigError for a head that is not sound.
+    Measurements count here regardless of the servos that are plugged in. Raises ConfigError for an invalid head.
     """
     head = load_head(name)
     raw = read(head_file(name))

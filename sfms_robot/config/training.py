@@ -13,7 +13,7 @@ from sfms_robot.config.listener import Arig, Count, Levels, Sfms, uneven_heads
 from sfms_robot.errors import ConfigError
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
-HALVINGS = 3  # of time, in a grouped tokenizer: 8 frames to a code
+HALVINGS = 3  # halvings of time in a grouped tokenizer: 8 frames per code
 _RESUMABLE = frozenset({"checkpoint_every", "checkpoint_minutes", "patience"})
 
 

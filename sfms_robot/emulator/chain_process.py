@@ -1,31 +1,31 @@
 """The process of an emulated chain: a pseudo terminal or a TCP port for the host, and a control socket.
 
-Pseudo terminals and sockets in the file system are Linux's; elsewhere both are TCP ports of loopback. Only sockets are
-waited for with `select` there: Windows takes nothing else, so a thread reads the pipe to the parent.
+Pseudo terminals and sockets in the file system are used on Linux; elsewhere both are TCP ports of loopback. There
+`select` waits for sockets only, since Windows supports nothing else; so a thread reads the pipe to the parent.
 
-Started by `launch`, which sends a description and receives where the chain is, or the ConfigError that refuses it. The
-process ends on SIGTERM, or when the pipe to its parent does.
+`launch` starts the process, sends it a description and receives the addresses of the chain, or a ConfigError if the
+description is invalid. The process ends on SIGTERM, or when the pipe to its parent ends.
 
-In real time bytes are answered when the wire says. In virtual time they wait in the device until a client of the
-control socket says how many there are and what time it is. Control requests and answers are one line each:
+In real time bytes are answered at the times of the wire. In virtual time they wait in the device until a client of the
+control socket sends their number and the time. Control requests and answers are one line each:
 
-    sync BYTES FROM SECONDS [UNTIL]  ack LENGTH  take BYTES in total at SECONDS, then send LENGTH bytes of reply, those
-                                                 due by UNTIL; what came by SECONDS for bytes before FROM is lost
-    quiet BYTES SECONDS              quiet LENGTH  take BYTES in total and send what is due within SECONDS after the
+    sync BYTES FROM SECONDS [UNTIL]  ack LENGTH  read BYTES in total at SECONDS, then send LENGTH bytes of reply, due by
+                                                 UNTIL; replies to bytes before FROM are lost unless a fault delays them
+    quiet BYTES SECONDS              quiet LENGTH  read BYTES in total and send replies due within SECONDS after the
                                                  last of them: LENGTH bytes in total, both since the client's first
                                                  such request
     time SECONDS                     ok          only advance the time
     digest                           digest SHA256 COUNT  of every byte the host sent
     kill ID | revive ID              ok          the servo falls silent, or answers again
     fault ID BITS                    ok          latch hardware errors
-    turn ID TICKS                    ok          turn the shaft by hand to where its position reads TICKS
+    turn ID TICKS                    ok          turn the shaft by hand to reported position TICKS
     heat ID DEGREES                  ok          set its temperature, which follows its load from then on
     state ID                         json {...}  its true state: position, goal, torque, ...
-    inject SPEC                      ok          a fault (see `faults`), from now on unless it says
-    clear                            ok          no more faults
-    supply VOLTS                     ok          of all servos
+    inject SPEC                      ok          add a fault (see `faults`), from now on unless it has a START
+    clear                            ok          end all faults
+    supply VOLTS                     ok          set the supply of all servos
     hangup | return                  ok          the adapter is unplugged, or plugged in again: same name, new device
-    stats | stamps | faults          json {...}  counts; the last replies, due and sent; faults that last or are to come
+    stats | stamps | faults          json {...}  counts; the last replies, due and sent; current and future faults
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ from sfms_robot.processes import ParentPipe, realtime_priority
 from sfms_robot.servo.registers import Table
 
 _CHUNK: Final = 4096
-_PATIENCE_S: Final = 1.0  # for bytes that a client said it had written
-_IDLE_S: Final = 0.25  # the longest that motors are left alone in real time
-_TCGETS2: Final = 0x802C542A  # struct termios2 holds any rate as a number, odd ones too
+_PATIENCE_S: Final = 1.0  # longest wait for bytes that a client has announced
+_IDLE_S: Final = 0.25  # longest interval between updates of the motors in real time
+_TCGETS2: Final = 0x802C542A  # struct termios2 contains any rate as a number, also unusual rates
 _TERMIOS2: Final = struct.Struct("=4IB19s2I")
 _OUTPUT_RATE: Final = -1
 _KINDS: Final[Mapping[tuple[str, int | None], Any]] = {  # family, protocol
@@ -71,10 +71,10 @@ _KINDS: Final[Mapping[tuple[str, int | None], Any]] = {  # family, protocol
 
 
 class PseudoTerminal:
-    """The open pty that the chain sits behind, on Linux.
+    """The open pty of the chain, on Linux.
 
-    `name` is a symbolic link to it, replaced when it is opened and removed when it is closed: the name stays when the
-    adapter is hung up and comes back.
+    `name` is a symbolic link to it, replaced when it is opened and removed when it is closed: the name stays the same
+    when the adapter is unplugged and comes back.
     """
 
     def __init__(self, link: str) -> None:
@@ -91,7 +91,7 @@ class PseudoTerminal:
         beside.replace(link)
 
     def watched(self) -> list[Any]:
-        """Return what is readable when there is something to `take`."""
+        """Return the objects for `select` that are readable when there are bytes to `take`."""
         return [self._fd]
 
     def take(self, count: int, patience_s: float) -> bytes:
@@ -106,13 +106,13 @@ class PseudoTerminal:
         return int(_TERMIOS2.unpack(raw)[_OUTPUT_RATE])
 
     def send(self, data: bytes, patience_s: float) -> None:
-        """Write the bytes that the terminal takes within `patience_s`; the rest is lost, as on a wire."""
+        """Write the bytes that the terminal accepts within `patience_s`; the rest is lost, as on a wire."""
         view = memoryview(data)
         while view and select.select([], [self._fd], [], patience_s)[1]:
             view = view[os.write(self._fd, view) :]
 
     def close(self) -> None:
-        """Close the device, and remove the link unless it points to another one by now."""
+        """Close the device, and remove the link unless it now points to another device."""
         if os.path.islink(self.name) and os.readlink(self.name) == self._path:
             os.unlink(self.name)
         os.close(self._fd)
@@ -120,20 +120,20 @@ class PseudoTerminal:
 
 
 class NetworkPort:
-    """The TCP port of loopback that the chain sits behind where there is no pty; methods as of `PseudoTerminal`.
+    """The TCP port of the chain on loopback, if there is no pty; methods as of `PseudoTerminal`.
 
-    It does not carry the rate of the host: the line has one rate, as a serial server's has. Several hosts may be
-    connected; answers go to the one that wrote last.
+    It does not transfer the rate of the host: the line has one rate, like that of a serial server. Several hosts may be
+    connected; answers go to the host that wrote last.
 
     Args:
-        name: its address when it was open before, so that it comes back under that.
+        name: its address if it was open before, so that it comes back with the same address.
     """
 
     def __init__(self, baud: int, name: str | None = None) -> None:
         self._baud = baud
         self._listener = socket.create_server((LOOPBACK, int(name.rpartition(":")[2]) if name else 0))
         self.name = f"socket://{LOOPBACK}:{self._listener.getsockname()[1]}"
-        self._hosts: list[socket.socket] = []  # the one that wrote last is the last
+        self._hosts: list[socket.socket] = []  # the host that wrote last is at the end
 
     def watched(self) -> list[Any]:
         return [self._listener, *self._hosts]
@@ -155,7 +155,7 @@ class NetworkPort:
             if data:
                 self._hosts.append(host)
                 return data
-            host.close()  # it has left
+            host.close()  # the host has disconnected
         return b""
 
     def baud(self) -> int:
@@ -167,7 +167,7 @@ class NetworkPort:
             while view and self._hosts and select.select([], self._hosts[-1:], [], patience_s)[1]:
                 view = view[self._hosts[-1].send(view) :]
         except OSError:
-            return  # it has left, which `take` sees next
+            return  # the host has disconnected; the next `take` detects it
 
     def close(self) -> None:
         for each in self.watched():
@@ -191,15 +191,15 @@ class _Client:
         try:
             self.connection.sendall(answer.encode() + b"\n")
         except OSError:
-            self.buffer.clear()  # it is gone; the end of its connection is seen next
+            self.buffer.clear()  # the client is gone; the next read detects the end of its connection
 
 
 class Server:
-    """Moves bytes between the device, the control socket and the wire.
+    """A server that moves bytes between the device, the control socket and the wire.
 
     Args:
         plug_in: opens the device, under the name that it had before.
-        control: the bound socket that takes requests. It is closed with the rest.
+        control: the bound socket for requests. `close` closes it too.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class Server:
         self._start_s = time.monotonic()
         self._now_s = 0.0
         self._idled_s = 0.0
-        self._received_s = 0.0  # when bytes came last
+        self._received_s = 0.0  # time at which the last bytes arrived
 
     def run(self, ended: socket.socket) -> None:
         """Serve until `ended` can be read."""
@@ -248,7 +248,7 @@ class Server:
         return self._now_s
 
     def _deliver(self) -> None:
-        """Send the answers that are due in real time. Bytes that the host does not take are lost, as on a wire."""
+        """Send the answers that are due in real time. Bytes that the host does not accept are lost, as on a wire."""
         self._advance(self._now())
         if self._now_s - self._idled_s >= _IDLE_S:
             self._idled_s = self._now_s
@@ -259,7 +259,7 @@ class Server:
             self._wire.sent(outs, self._now())
 
     def _advance(self, now_s: float) -> None:
-        """Move the wire on, then hang up or come back as it says."""
+        """Advance the wire, then unplug the device or plug it in again, according to its `hung`."""
         self._wire.advance(now_s)
         if self._wire.hung and self._device is not None:
             self._device.close()
@@ -322,9 +322,10 @@ class Server:
         self._wire.sent(outs, None)
 
     def _quiet(self, client: _Client, count: int, patience_s: float) -> str:
-        """Take the bytes that a client has written, and send what is due in its patience: silence is the servos' then.
+        """Receive the bytes that a client has written, and send the replies due within `patience_s`.
 
-        Bytes may have come here later than they were written; the client's patience counts from when they came.
+        After that a silence comes from the servos. Bytes may have arrived here later than they were written;
+        `patience_s` counts from their arrival.
         """
         if client.since is None:
             client.since = self._wire.traffic
@@ -341,7 +342,7 @@ class Server:
         return f"quiet {self._wire.traffic[1] - sent}"
 
     def _command(self, words: list[str]) -> str:
-        """Carry out any other request; return the answer. Raises ValueError for a number that cannot be read."""
+        """Execute any other request; return the answer. Raises ValueError for an invalid number."""
         wire = self._wire
         if words[0] == "time":
             self._now_s = float(words[1])
@@ -427,8 +428,8 @@ def _bound(description: Mapping[str, Any], folder: str) -> tuple[socket.socket, 
 
 
 def main() -> None:
-    """Read the description, report where the chain is, serve."""
-    parent = ParentPipe()  # ignores Ctrl-C, which is for the host: it still has to stop its servos
+    """Read the description, report the addresses of the chain, and serve."""
+    parent = ParentPipe()  # ignores Ctrl-C, which is meant for the host: the host still has to stop its servos
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     description = parent.receive()
     try:
@@ -443,7 +444,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="sfms-robot-", ignore_cleanup_errors=True) as folder:
         control, place, plug_in = _bound(description, folder)
         server = Server(wire, description["virtual"], plug_in, control)
-        # A servo has a processor of its own: it answers in time whatever else this computer does.
+        # A real servo has its own processor: it answers in time under any load of this computer.
         with closing(server), realtime_priority(wanted=not description["virtual"]) as priority:
             parent.send({"device": server.device, "control": place, "folder": folder, "priority": priority})
             server.run(ended)

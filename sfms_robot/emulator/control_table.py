@@ -1,4 +1,4 @@
-"""Control table of an emulated servo: its bytes, and how they command the motor.
+"""Control table of an emulated servo: its bytes, and the commands for the motor that follow from them.
 
     family         mode              selected by                        goal
     X, MX (2.0)    current           operating mode 0                   goal current (102), fraction of its limit (38)
@@ -17,8 +17,8 @@
     STS            multi-turn        both angle limits 0                goal position (42) beyond one turn
     SCS            PWM               both angle limits 0                register 44, sign in bit 10, 1000 = full voltage
 
-In all other cases the servo is a joint: a position within its angle limits. A Dynamixel 1.0 whose lower limit is above
-the upper one drives nothing.
+In all other cases the servo is a joint: it moves to a position within its angle limits. A Dynamixel 1.0 whose lower
+limit is not below the upper one does not drive its motor.
 
 Sources: ROBOTIS e-manual, "Operating Mode (11)", "Drive Mode (10)", "Homing Offset (20)", "Profile Velocity (112)" of
 the X series, "CW/CCW Angle Limit" and "Moving Speed" of ax-12a and mx-28; Feetech memory table V3.6 and the SCS15
@@ -36,25 +36,25 @@ from sfms_robot.servo.registers import Field, Table
 
 _WHOLE_SPACE: Final = 256
 _WINDOW: Final = "indirect_data_"
-_CACHED: Final = 1024  # blocks whose registers are remembered: a host that sends noise must not fill the memory
+_CACHED: Final = 1024  # size of the cache of `covered`: a host that sends noise must not fill the memory
 _REVERSE, _PROFILE_BY_TIME, TORQUE_ON_BY_GOAL = 0x01, 0x04, 0x08  # drive mode (10), bits 0, 2 and 3
-_SINGLE_TURN_OFFSET: Final = 1024  # homing offset (20) is held to +-90 degrees in position mode
+_SINGLE_TURN_OFFSET: Final = 1024  # homing offset (20) is limited to +-90 degrees in position mode
 _MX_MULTI_TURN: Final = 4095
 _FULL_PWM: Final = 885.0  # goal PWM (100): 100 %
 _FULL_DUTY: Final = 1000.0  # Feetech, register 44 in PWM mode: 100 %
-_FULL_TORQUE: Final = 1000  # torque limit: 0.1 %, although it goes to 1023 in Dynamixels
+_FULL_TORQUE: Final = 1000  # torque limit, in units of 0.1 %, although Dynamixels allow values up to 1023
 _FULL_AX_SPEED: Final = 1023.0
 _SCS_SIGN: Final = 1 << 10
 _COUNTS_TURNS: Final = 0x10  # STS phase (18), bit 4: positions beyond one turn are reported
 
 
 class ControlTable:
-    """Values by name of a register, or of the role that it plays in its family, and raw bytes by address.
+    """Values of registers, by name or by role in their family, and raw bytes by address.
 
-    Reading an absent register gives its default.
+    Reading an absent register returns a default.
 
-    An indirect data register is a window: byte k of the block shows the byte whose address stands in
-    `indirect_address_k`. The firmware map says where the block lies (X330 servos up to firmware 52 have it elsewhere).
+    An indirect data register is a window: byte k of the block shows the byte at the address in `indirect_address_k`.
+    The address of the block is in the firmware map (it differs for X330 servos up to firmware 52).
 
     A Feetech answers a read of any address.
     """
@@ -66,7 +66,7 @@ class ControlTable:
         self._named = {role: field for role in table.roles if (field := table.role(role))} | dict(fields)
         self._ranges = {name: _value_range(field) for name, field in self._named.items()}
         self.covered = lru_cache(maxsize=_CACHED)(self._covered)
-        self._windows = {  # address of an indirect data byte -> address of the word that says what it shows
+        self._windows = {  # address of an indirect data byte -> address of the word with the address that it shows
             field.address: fields[word].address
             for name, field in fields.items()
             if name.startswith(_WINDOW) and (word := f"indirect_address_{name.removeprefix(_WINDOW)}") in fields
@@ -79,7 +79,7 @@ class ControlTable:
         return default if field is None else field.from_bytes(self.raw[field.address : field.address + field.size])
 
     def put(self, name: str, value: int) -> None:
-        """Set a register to the nearest value that it can hold; do nothing where the model has no such register."""
+        """Set a register to the nearest value that it can hold; do nothing if the model has no such register."""
         field = self._named.get(name)
         if field is not None:
             low, high = self._ranges[name]
@@ -91,14 +91,14 @@ class ControlTable:
         return tuple(f for f in self.table.fields.values() if f.address < end and f.address + f.size > address)
 
     def runs(self, address: int, length: int) -> list[tuple[int, int]]:
-        """Return (address, length) of the pieces of memory that a block stands for, seen through its windows."""
+        """Return (address, length) of the pieces of memory that a block shows, with its windows resolved."""
         if address > self._last_window or address + length <= self._first_window:
             return [(address, length)]
         out: list[tuple[int, int]] = []
         for at in range(address, address + length):
             word = self._windows.get(at, -1)
             target = at if word < 0 else self.raw[word] | self.raw[word + 1] << 8
-            if target >= len(self.raw) or (target != at and target in self._windows):  # no windows behind windows
+            if target >= len(self.raw) or (target != at and target in self._windows):  # no window of a window
                 target = at
             if out and sum(out[-1]) == target:
                 out[-1] = (out[-1][0], out[-1][1] + 1)
@@ -146,7 +146,7 @@ _MODES: Final = {  # family, register -> value -> mode
 
 
 def angle_limits(memory: ControlTable) -> tuple[int, int]:
-    """Return the lowest and the highest goal of a joint; one whole turn where the model has no limits."""
+    """Return the lowest and the highest goal of a joint; one whole turn if the model has no limits."""
     last = round(memory.table.ticks_per_revolution) - 1
     lowest = memory.get("min_position_limit", memory.get("cw_angle_limit"))
     return lowest, memory.get("max_position_limit", memory.get("ccw_angle_limit", last))
@@ -168,16 +168,16 @@ def mode_of(memory: ControlTable) -> Mode:
 
 
 class ServoFrame:
-    """Position registers <-> ticks of the shaft: register = sign * shaft / divider + offset.
+    """Conversion of position registers and ticks of the shaft: register = sign * shaft / divider + offset.
 
     Attributes:
-        sign: -1 where the drive mode of a Dynamixel 2.0 reverses the direction. It leaves the offset alone.
+        sign: -1 if the drive mode of a Dynamixel 2.0 reverses the direction. The homing offset keeps its sign.
     """
 
     def __init__(self, memory: ControlTable, mode: Mode) -> None:
         table, get, goal = memory.table, memory.get, memory.table["goal_position"]
         self._turn = table.ticks_per_revolution
-        self._highest = goal.high if goal.high < self._turn else None  # a potentiometer sees a part of the turn
+        self._highest = goal.high if goal.high < self._turn else None  # a potentiometer covers only a part of the turn
         self._divider, self.sign = 1, 1.0
         homing = get("homing_offset")
         if table.protocol == 2:
@@ -195,15 +195,18 @@ class ServoFrame:
             self._counts = bool(get("phase") & _COUNTS_TURNS and "operating_mode" in table.fields)
 
     def reported(self, shaft: float) -> float:
-        """Return the position in ticks of the registers, beyond one turn as well."""
+        """Return the position in ticks of the registers, also beyond one turn."""
         return self.sign * shaft / self._divider + self._offset
 
     def shaft(self, reported: float) -> float:
-        """Return the shaft's position of a reported one."""
+        """Return the position of the shaft from a reported position."""
         return self.sign * (reported - self._offset) * self._divider
 
     def shown(self, shaft: float) -> int:
-        """Return what the present position reads: a servo that does not count turns shows one, with or without gap."""
+        """Return the value of register present position.
+
+        A servo that does not count turns reports a position in one turn, and with a potentiometer none in its gap.
+        """
         ticks = round(self.reported(shaft))
         if self._counts:
             return ticks
@@ -218,11 +221,11 @@ class ServoFrame:
 def motor_command(
     memory: ControlTable, mode: Mode, frame: ServoFrame, reference: float, stepped: float
 ) -> MotorCommand | None:
-    """Return the command of a motor under torque, or None where the registers command nothing.
+    """Return the command of a motor under torque, or None if the registers command nothing.
 
     Args:
-        reference: Where the profile stands, ticks of the shaft.
-        stepped: Where the steps of step mode lead, ticks of the shaft.
+        reference: Position of the profile, ticks of the shaft.
+        stepped: Goal of the steps in step mode, ticks of the shaft.
     """
     table, get = memory.table, memory.get
     top, torque = table.top_speed_ticks_s, min(1.0, get("torque_limit", _FULL_TORQUE) / _FULL_TORQUE)
@@ -249,7 +252,7 @@ def motor_command(
 
 
 def _profile(memory: ControlTable, distance: float) -> tuple[float, float]:
-    """Return the limits of speed and acceleration of a way of `distance`, in ticks and seconds; 0 means unlimited."""
+    """Return the limits of speed and acceleration over `distance`, in ticks and seconds; 0 means unlimited."""
     table = memory.table
     if memory.get("drive_mode") & _PROFILE_BY_TIME and table.protocol == 2:  # both registers are durations in ms
         whole_ms = memory.get("profile_velocity")
@@ -262,7 +265,7 @@ def _profile(memory: ControlTable, distance: float) -> tuple[float, float]:
 
 
 def _duty(memory: ControlTable) -> float:
-    """Return the duty of a Feetech in PWM mode, -1..1."""
+    """Return the duty cycle of a Feetech in PWM mode, -1..1."""
     value = memory.get("goal_time")
     if "operating_mode" not in memory.table.fields and value & _SCS_SIGN:
         value = -(value & _SCS_SIGN - 1)
@@ -270,5 +273,5 @@ def _duty(memory: ControlTable) -> float:
 
 
 def _rate(memory: ControlTable, field: Field | None) -> float:
-    """Return a speed or an acceleration in ticks and seconds, with its sign; 0 where the model has no such register."""
+    """Return a speed or an acceleration in ticks and seconds, with its sign; 0 if the model has no such register."""
     return 0.0 if field is None else memory.table.in_ticks(field, memory.get(field.name))

@@ -1,8 +1,8 @@
-"""One emulated wire: devices receive the host's bytes, their answers leave in time, and faults come between.
+"""One emulated wire: it passes bytes from the host to devices and their answers back, with delays and faults.
 
-In `instant` timing an answer leaves at once. In `wire` timing the line is a line: the request takes 10 bits a byte to
-arrive, each servo waits its return delay, and its answer takes 10 bits a byte; an answer is due when its last bit is
-through. An answer that leaves later than it was due is the fault of the emulator, and is counted as `emulator_late`.
+In `instant` timing an answer leaves at once. In `wire` timing the request takes 10 bits a byte to arrive, each servo
+waits for its return delay, and its answer takes 10 bits a byte. An answer is due when its last bit has been sent. If it
+leaves more than `LATE_S` after that, the emulator is too slow; such answers are counted as `emulator_late`.
 
 `EmulatedServo` is plain data, so that the process of an emulated chain loads neither configs nor libraries.
 """
@@ -22,7 +22,7 @@ from sfms_robot.errors import ConfigError
 
 Timing = Literal["instant", "wire"]
 LATE_S: Final = 0.001
-_BITS: Final = 10  # of a byte, with start and stop
+_BITS: Final = 10  # bits of a byte on the line, with start and stop bit
 _STAMPS: Final = 4096
 
 
@@ -31,10 +31,10 @@ class EmulatedServo:
     """A servo that is plugged in, or a channel of a board.
 
     Attributes:
-        start_ticks: Its position when the host comes, torque off; outside its limits, or beyond one turn where it was
-            turned by hand after it was switched on.
-        registers: Values stored in it before, by name (homing offset, position limits, shutdown, ...).
-        supply_v: None is a voltage within its limits.
+        start_ticks: Its position when the host connects, with torque off. It may be outside its limits, or beyond one
+            turn if the shaft was turned by hand after the servo was switched on.
+        registers: Values stored in it, by name (homing offset, position limits, shutdown, ...).
+        supply_v: Supply voltage; None for a voltage within its limits.
     """
 
     id: int
@@ -48,7 +48,7 @@ class EmulatedServo:
 
 
 class Reply(NamedTuple):
-    """One packet on the wire: its senders, and how long the line is quiet before it. A board names no senders."""
+    """One packet on the wire: its senders (none for a board), its bytes, and the pause on the line before it."""
 
     servos: tuple[int, ...]
     data: bytes
@@ -56,34 +56,34 @@ class Reply(NamedTuple):
 
 
 class EmulatedDevice(ABC):
-    """All servos of one protocol, or one board. It receives every byte of the wire and keeps its own place in it."""
+    """All servos of one protocol, or one board. It receives every byte of the wire into its own buffer."""
 
     servos: Sequence[Any]
 
     @abstractmethod
     def replies(self, data: bytes, baud: int | None, now_s: float) -> list[Reply]:
-        """Take bytes that the host sent at `baud` (None: unknown) and return the answers, packet by packet."""
+        """Process bytes that the host sent at `baud` (None: unknown); return the answers, packet by packet."""
 
     def receive(self, data: bytes, baud: int | None, now_s: float) -> bytes:
         """Return the bytes of `replies`."""
         return b"".join(reply.data for reply in self.replies(data, baud, now_s))
 
     def servo(self, servo_id: int) -> Any:
-        """Return the first servo or channel of that id, or None."""
+        """Return the first servo or channel with an id, or None."""
         return next((servo for servo in self.servos if servo.id == servo_id), None)
 
     def advance(self, now_s: float) -> None:
-        """Move all its servos on to `now_s`."""
+        """Advance all its servos to `now_s`."""
         for servo in self.servos:
             servo.advance(now_s)
 
     def restart(self, now_s: float) -> None:
-        """Restart a board whose supply came back; servos with a controller restart on their own."""
+        """Restart a board whose supply failed or came back; servos with a controller restart without this call."""
         return
 
 
 class Out(NamedTuple):
-    """Bytes on their way to the host. `late`: a fault holds them back."""
+    """Bytes on their way to the host. `late`: True if a fault delays them."""
 
     due_s: float
     number: int
@@ -93,11 +93,11 @@ class Out(NamedTuple):
 
 
 class EmulatedWire:
-    """Devices, faults and the line between. Times are seconds of the emulator's clock.
+    """Devices, the line to them, and its faults. Times are seconds of the emulator's clock.
 
     Attributes:
-        faults: What lasts or is to come; one is added by `add`.
-        hung: The adapter is unplugged; the server closes the terminal meanwhile.
+        faults: Current and future faults; `add` adds one.
+        hung: True while the adapter is unplugged; the server then closes the terminal.
     """
 
     def __init__(self, devices: Sequence[EmulatedDevice], timing: Timing, faults: Iterable[Fault], seed: int) -> None:
@@ -108,7 +108,7 @@ class EmulatedWire:
         self._inbox = deque[tuple[float, bytes, int | None]]()  # (arrives at, data, baud), in that order
         self._outbox: list[Out] = []
         self._number = 0
-        self._free_s = 0.0  # until then the line is busy
+        self._free_s = 0.0  # time until which the line is busy
         self._before_brownout: dict[int, float] = {}
         self._seen = hashlib.sha256()
         self._stamps = deque[tuple[tuple[int, ...], float, float]](maxlen=_STAMPS)
@@ -118,7 +118,7 @@ class EmulatedWire:
             self.add(fault)
 
     def servo(self, servo_id: int) -> Any:
-        """Return the servo or channel of that id on any device, or None."""
+        """Return the servo or channel with an id on any device, or None."""
         return next((servo for each in self._devices if (servo := each.servo(servo_id)) is not None), None)
 
     @property
@@ -127,13 +127,13 @@ class EmulatedWire:
         return self._counts["bytes_in"], self._counts["bytes_out"]
 
     def digest(self) -> tuple[str, int]:
-        """Return SHA-256 and number of all bytes the host ever sent, at whatever baud."""
+        """Return SHA-256 and number of all bytes that the host has sent, at any baud rate."""
         return self._seen.hexdigest(), self._counts["bytes_in"]
 
     # --- traffic ------------------------------------------------------------------------------------------------
 
     def receive(self, data: bytes, baud: int | None, now_s: float) -> None:
-        """Take bytes that the host sent at `baud` (None: unknown); the answers wait in the outbox."""
+        """Receive bytes that the host sent at `baud` (None: unknown); put the answers into the outbox."""
         self.advance(now_s)
         self._seen.update(data)
         self._counts["bytes_in"] += len(data)
@@ -150,7 +150,7 @@ class EmulatedWire:
             self._post(Reply((), noise), self._free_s if self._on_the_wire else now_s, 0.0)
 
     def _deliver(self, until_s: float) -> None:
-        """Hand the requests that arrive by `until_s` to the devices, and post their answers."""
+        """Pass the requests that arrive by `until_s` to the devices, and post their answers."""
         while self._inbox and self._inbox[0][0] <= until_s:
             now_s, data, baud = self._inbox.popleft()
             self._turn_faults(now_s)
@@ -162,7 +162,7 @@ class EmulatedWire:
                         self._post(reply._replace(data=spoilt), due_s, late_s)
 
     def take(self, until_s: float, all_but_late: bool = False) -> list[Out]:
-        """Return the bytes due by `until_s`, in order; with `all_but_late` also those that no fault holds back."""
+        """Return the bytes due by `until_s`, in order; with `all_but_late` also all bytes that no fault delays."""
         self._deliver(until_s)
         if not self._outbox:
             return []
@@ -171,7 +171,7 @@ class EmulatedWire:
         return out
 
     def sent(self, outs: Iterable[Out], now_s: float | None) -> None:
-        """Stamp the bytes that have just left; None: in virtual time, where nothing is late."""
+        """Record the time of bytes that have just left; `now_s` None: in virtual time, where nothing is late."""
         for out in outs:
             at_s = out.due_s if now_s is None else now_s
             self._stamps.append((out.servos, out.due_s, at_s))
@@ -185,17 +185,17 @@ class EmulatedWire:
         return min([self.faults.next_s, *(out.due_s for out in self._outbox), *(each[0] for each in self._inbox)])
 
     def statistics(self) -> Report:
-        """Return counts since the start, the lateness of answers [ms], and how long the line was busy [s]."""
+        """Return counts since the start, the lateness of answers [ms], and the time that the line was busy [s]."""
         late: Sequence[float | None] = sorted(1e3 * (at_s - due_s) for _, due_s, at_s in self._stamps) or [None]
         spread = {f"p{q}": late[min(len(late) - 1, len(late) * q // 100)] for q in (50, 99)} | {"max": late[-1]}
         return {**self._counts, "busy_s": self._busy_s, "late_ms": spread}
 
     def stamps(self) -> list[Report]:
-        """Return the last answers: senders, time due, time gone."""
+        """Return the last answers: senders, time due, time sent."""
         return [{"ids": ids, "due_s": due_s, "sent_s": at_s} for ids, due_s, at_s in self._stamps]
 
     def _occupy(self, start_s: float, count: int, baud: int | None) -> float:
-        """Fill the line with `count` bytes from `start_s` on; return when the last one is through."""
+        """Occupy the line with `count` bytes from `start_s` on; return the time when the last one is sent."""
         seconds = _BITS * count / baud if baud else 0.0
         self._busy_s += seconds
         if not self._on_the_wire:
@@ -211,7 +211,7 @@ class EmulatedWire:
     # --- faults -------------------------------------------------------------------------------------------------
 
     def add(self, fault: Fault) -> None:
-        """Add a fault. Raises ConfigError when no servo of the wire can have it."""
+        """Add a fault. Raises ConfigError if no servo of the wire can have it."""
         servos = self._supplied if fault.kind == "voltage" else self._servos
         if fault.kind not in ("echo", "noise", "hangup") and not any(map(fault.concerns, servos)):
             raise ConfigError.at("emulate", "fault", fault.text, "concerns no servo of this wire")
@@ -223,7 +223,7 @@ class EmulatedWire:
         self._turn_faults(now_s)
 
     def idle(self, now_s: float) -> None:
-        """Move everything on, so that no servo has to make up for a long silence."""
+        """Advance all devices, so that no servo has to catch up after a long silence."""
         self.advance(now_s)
         for device in self._devices:
             device.advance(now_s)
@@ -239,7 +239,7 @@ class EmulatedWire:
 
     @property
     def _supplied(self) -> list[Any]:
-        """Servos with a controller of their own; those of a board know no supply."""
+        """Servos with their own controller; servos of a board do not measure their supply."""
         return [servo for servo in self._servos if hasattr(servo, "set_supply")]
 
     def _turn_faults(self, now_s: float) -> None:
@@ -268,4 +268,4 @@ class EmulatedWire:
                     servo.fail(servo.fault_bits["overheating" if kind == "overheat" else kind], time_s)
             if kind == "brownout":
                 for device in self._devices:
-                    device.restart(time_s)  # a board without a supply makes no pulses either
+                    device.restart(time_s)  # a board without a supply sends no pulses either

@@ -1,13 +1,13 @@
-"""Faults on request: kind, ids, start, end and amount.
+"""Faults of an emulated wire, specified by kind, ids, start, end and value.
 
     KIND[:IDS][@START[-END]][=VALUE]        drop:3,5-7@2-4=0.5    delay:2=0.012    brownout@1    noise=0.1
 
-Times are seconds of the emulator's clock; a fault without an END lasts, except for brownout and hangup. All chance
-comes from one seeded generator, so that in virtual time the same requests meet the same faults.
+Times are seconds of the emulator's clock; a fault without an END lasts for ever, except brownout and hangup. All random
+numbers come from one seeded generator, so that in virtual time the same requests have the same faults.
 
-`drop`, `corrupt`, `delay` and their like hit what servos send; `request-drop`, `request-corrupt` and `request-delay`
-hit what the host sends, each write as a whole and for all servos of the wire alike. Corrupted: one byte of it became
-another.
+`drop`, `corrupt`, `delay` and similar kinds affect packets from servos. `request-drop`, `request-corrupt` and
+`request-delay` affect data from the host: each write as a whole, in the same way for all servos of the wire. In corrupt
+data one byte is replaced by another.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sfms_robot.errors import ConfigError
 
 
 class Kind(NamedTuple):
-    """Meaning of VALUE ("" takes none), its default and range, and how long the fault lasts by default."""
+    """Meaning of VALUE ("" if there is no value), its default and range, and the default duration of the fault."""
 
     meaning: str
     value: float = 1.0
@@ -38,7 +38,7 @@ class Kind(NamedTuple):
 _OF_REPLIES: Final = Kind("fraction of replies")
 _OF_REQUESTS: Final = Kind("fraction of requests", ids=False)
 _STATE: Final = Kind("")
-TO_SERVOS: Final = "request-"  # kinds of faults between host and servos begin with this; the others hit replies
+TO_SERVOS: Final = "request-"  # prefix of the kinds that affect requests to servos; the others affect replies
 KINDS: Final = {
     "drop": _OF_REPLIES,
     "delay": Kind("seconds", 0.02, 0.0, 60.0),
@@ -67,7 +67,7 @@ _SPEC: Final = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """One fault. `ids` None: all servos. `text` is the spec as it was given."""
+    """One fault. `ids` None: all servos. `text`: the spec from which it was read."""
 
     kind: str
     ids: frozenset[int] | None
@@ -77,11 +77,11 @@ class Fault:
     text: str
 
     def concerns(self, servo: Any) -> bool:
-        """Return whether a servo or channel can have it."""
+        """Return whether a servo or channel can have this fault."""
         return self.ids is None or servo.id in self.ids
 
     def meets(self, servos: Sequence[int], now_s: float) -> bool:
-        """Return whether it hits a packet from `servos` now."""
+        """Return whether this fault affects a packet from `servos` now."""
         return self.start_s <= now_s < self.end_s and (self.ids is None or not self.ids.isdisjoint(servos))
 
 
@@ -135,7 +135,7 @@ class WireFaults:
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
         self._faults: list[Fault] = []
-        self._edges: list[tuple[float, Fault, bool]] = []  # (time, fault, it begins), in the order of their times
+        self._edges: list[tuple[float, Fault, bool]] = []  # (time, fault, whether it begins), in order of time
 
     def add(self, fault: Fault) -> None:
         """Add a fault."""
@@ -149,7 +149,7 @@ class WireFaults:
         self._faults = []
 
     def texts(self, now_s: float) -> list[str]:
-        """Return the specs of faults that last or are to come."""
+        """Return the specs of current and future faults."""
         return [fault.text for fault in self._faults if now_s < fault.end_s]
 
     @property
@@ -158,7 +158,7 @@ class WireFaults:
         return self._edges[0][0] if self._edges else math.inf
 
     def edges(self, now_s: float) -> Iterator[tuple[float, Fault, bool]]:
-        """Yield (time, fault, it begins) of all that began or ended by now, once each, in order."""
+        """Yield (time, fault, whether it begins) for each begin and end of a fault up to `now_s`, once, in order."""
         while self.next_s <= now_s:
             time_s, fault, began = self._edges.pop(0)
             if not began and fault in self._faults:
@@ -168,7 +168,7 @@ class WireFaults:
     def spoil(self, servos: Sequence[int], data: bytes, now_s: float, way: str = "") -> list[tuple[bytes, float]]:
         """Return the packets that arrive for a reply of `servos`, or with `way` `TO_SERVOS` for one write of the host.
 
-        Each is (bytes, seconds late); none when it is lost.
+        Each packet is (bytes, seconds late); the list is empty if the packet is lost.
         """
         out = [(data, 0.0)]
         for fault in self._faults:
@@ -182,7 +182,7 @@ class WireFaults:
         return out
 
     def strikes(self, kind: str, now_s: float) -> bool:
-        """Return whether a fault of the adapter happens at this request: echo, noise."""
+        """Return whether a fault of the adapter (echo, noise) occurs at this request."""
         return any(self._random.random() < f.value for f in self._faults if f.kind == kind and f.meets((), now_s))
 
     def noise(self, now_s: float) -> bytes:

@@ -5,7 +5,7 @@
 
 Servos of several protocols, and boards, may share one wire.
 
-The process ends with the `with` block, and when this one dies.
+The process ends with the `with` block, and when the process that started it dies.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ BehindSilent = Literal["chain_break", "skip"]
 Transport = Literal["pty", "tcp"]
 
 READ_DEADLINE_S = 0.02  # an emulator shares the computer's cores: it may be late without being silent
-PROMPT_DEADLINE_S = 0.005  # one with real-time priority
+PROMPT_DEADLINE_S = 0.005  # deadline for an emulator with real-time priority
 
 _START_S = 20.0
 _CLOSE_S = 5.0
@@ -63,10 +63,10 @@ class Chain:
         device: Path of the serial device, or socket://HOST:PORT; it stays the same when the adapter is unplugged and
             comes back.
         control: Path of the control socket, or HOST:PORT.
-        virtual: True when time is virtual, so that the device answers only through a `VirtualTimePort`.
-        servos: what is plugged in.
-        priority: "fifo" where it answers as promptly as hardware; else why not (`processes.realtime_priority`).
-        child, folder: its process, and the folder of its socket; both end with it.
+        virtual: True if time is virtual, so that the device answers only through a `VirtualTimePort`.
+        servos: servos and channels that are plugged in.
+        priority: "fifo" if it answers as promptly as hardware; else the reason (`processes.realtime_priority`).
+        child, folder: its process, and the folder of its socket; `close` ends and removes them.
     """
 
     child: Child
@@ -84,11 +84,11 @@ class Chain:
 
     @property
     def read_deadline_s(self) -> float:
-        """Return the silence after which one of its servos counts as silent [s]."""
+        """Return the time without an answer after which one of its servos counts as silent [s]."""
         return PROMPT_DEADLINE_S if self.priority == "fifo" else READ_DEADLINE_S
 
     def kill(self, servo_id: int) -> None:
-        """Silence a servo, as with its cable out; its motor follows its last goal."""
+        """Silence a servo, as with its cable unplugged; its motor follows its last goal."""
         self.ask(f"kill {servo_id}")
 
     def revive(self, servo_id: int) -> None:
@@ -100,7 +100,7 @@ class Chain:
         self.ask(f"fault {servo_id} {bits}")
 
     def turn(self, servo_id: int, ticks: int) -> None:
-        """Turn the shaft by hand to where its position reads `ticks`; beyond one turn, too."""
+        """Turn the shaft by hand to reported position `ticks`, which may be beyond one turn."""
         self.ask(f"turn {servo_id} {ticks}")
 
     def heat(self, servo_id: int, temperature_C: float) -> None:
@@ -120,7 +120,7 @@ class Chain:
         self.ask("clear")
 
     def faults(self) -> list[str]:
-        """Return the specs of faults that last or are to come."""
+        """Return the specs of current and future faults."""
         return cast("list[str]", self._json("faults"))
 
     def supply(self, volts: float) -> None:
@@ -132,7 +132,7 @@ class Chain:
         self.ask("hangup")
 
     def come_back(self) -> None:
-        """Plug it in again."""
+        """Plug the adapter in again."""
         self.ask("return")
 
     def time_is(self, now_s: float) -> None:
@@ -157,7 +157,7 @@ class Chain:
         self.child.close(_CLOSE_S)
         shutil.rmtree(self.folder, ignore_errors=True)
         if os.path.islink(self.device) and not os.path.exists(self.device):
-            os.unlink(self.device)  # it was killed, and left its link behind
+            os.unlink(self.device)  # the process was killed and did not remove its link
 
     def __enter__(self) -> Self:
         return self
@@ -169,7 +169,7 @@ class Chain:
         return json.loads(self.ask(request).removeprefix("json "))
 
     def ask(self, request: str) -> str:
-        """Send one line to the control socket and return the answer. Raises BusError when it is refused."""
+        """Send one line to the control socket and return the answer. Raises BusError if it is refused."""
         try:
             with connect(self.control) as control:
                 control.sendall(request.encode() + b"\n")
@@ -196,14 +196,14 @@ def launch(
 
     Args:
         virtual: the host sets the time (see `servo.port.VirtualTimePort`).
-        timing: replies at once, or in the time that bytes and return delays take.
-        behind_silent: "chain_break" silences the ids behind a silent one in a sync read.
-        faults: specs (see `emulator.faults`); `seed` of their random numbers.
+        timing: "instant": replies at once; "wire": after the time of bytes and return delays.
+        behind_silent: "chain_break" silences the ids after a silent id in a sync read.
+        faults: specs (see `emulator.faults`); `seed`: seed of their random numbers.
         link: a symbolic link to the device, removed at the end.
-        transport: pseudo terminal, or TCP port of loopback, which has one rate: that of the first servo.
+        transport: pseudo terminal, or TCP port of loopback, which has only one rate: that of the first servo.
 
-    Raises ConfigError for an unknown model, register or fault, a baud the model does not have, an id used twice or a
-    link that is taken; BusError when the process does not start.
+    Raises ConfigError for an unknown model, register or fault, a baud rate that the model does not have, an id used
+    twice or a link that already exists; BusError if the process does not start.
     """
     named = {servo.model: load_firmware_map(servo.model) for servo in servos}
     maps = [

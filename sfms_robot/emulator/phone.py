@@ -1,4 +1,4 @@
-"""An emulated phone: recorded packets of a real one, sent again at their pace. Also as a command:
+"""An emulated phone, which sends recorded packets of a real phone at their original pace. Also a command:
 
     python -m sfms_robot.emulator.phone [[HOST:]PORT]
 
@@ -27,10 +27,10 @@ _LENGTH: Final = struct.Struct(">I")
 
 
 def recorded_packets(path: Path | None = None) -> list[bytes]:
-    """Return packets of Live Link Face as the phone sent them; by default those that ship with the package.
+    """Return packets of Live Link Face as the phone sent them; by default those included in this package.
 
     A file is gzip of one byte, a big-endian uint32 count, and per packet its uint32 length and bytes. Raises
-    ConfigError for another.
+    ConfigError for any other file.
     """
     file = data_dir("sim") / "phones" / "llv" / "packets.gesichter" if path is None else path
     try:
@@ -55,9 +55,9 @@ def renumbered(packet: bytes, number: int) -> bytes:
 
 
 class EmulatedPhone:
-    """A sender of the packets that ship; packet i is due at i / `RATE_HZ`.
+    """A sender of the packets included in this package; packet i is due at i / `RATE_HZ`.
 
-    The recording is played to its end and back without end, with increasing numbers. The caller gives the time.
+    The recording is played forwards and backwards in a loop, with increasing numbers. The caller passes the time.
     """
 
     def __init__(self, host: str = LOOPBACK, port: int = PORT) -> None:

@@ -1,12 +1,12 @@
-"""Motor of an emulated servo: a profile generator, then a motor that follows it and grows warm.
+"""Motor of an emulated servo: a profile generator, then a motor that follows it and heats up.
 
     reference   trapezoid towards the goal under profile velocity and acceleration (0 = no limit: it jumps)
-    motor       x'' = w^2 (reference - x) - 2 w x' - load, with |x''| and |x'| held to what the motor can do
+    motor       x'' = w^2 (reference - x) - 2 w x' - load, with |x''| and |x'| limited to those of the motor
     heat        T' = (ambient + _HEATING * effort^2 - T) / _COOLING_S
 
-Critically damped, so a servo lags a ramp by 2 / w = 33 ms and does not ring; under a load it hangs a little below its
-goal, as a proportional controller does. Time runs on a fixed grid of `STEP_S`: the position depends on the commands
-and their times, never on how often it is read.
+The motor is critically damped, so a servo lags a ramp by 2 / w = 33 ms and does not oscillate. Under a load it stays a
+little below its goal, like a proportional controller. Time advances on a fixed grid of `STEP_S`: the position depends
+on the commands and their times, never on the number of reads.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from typing import Final, NamedTuple
 
 STEP_S: Final = 0.002
 AMBIENT_C: Final = 31.0
-OVERLOAD_S: Final = 1.0  # at full effort without turning
+OVERLOAD_S: Final = 1.0  # time at full effort without turning until overload
 _STIFFNESS: Final = 60.0  # w, 1/s
-_SPIN_UP_S: Final = 0.05  # from rest to top speed
+_SPIN_UP_S: Final = 0.05  # time from rest to top speed
 _FRICTION_MA: Final = 25.0
-_CREEP: Final = 20.0  # ticks/s, from where on friction is whole
-_STALL_MA: Final = 1200.0  # at full effort
-_THERE: Final = 0.02  # ticks from the goal at which a motor has arrived
-_HEATING: Final = 110.0  # degrees above ambient of a motor that stalls for good
+_CREEP: Final = 20.0  # speed from which on friction is full, ticks/s
+_STALL_MA: Final = 1200.0  # current at full effort
+_THERE: Final = 0.02  # distance from the goal at which a motor has arrived, ticks
+_HEATING: Final = 110.0  # final temperature above ambient of a motor that stalls permanently, degrees
 _COOLING_S: Final = 45.0
 _HEAT_STEPS: Final = 100
 _DECAY: Final = 1.0 - math.exp(-_HEAT_STEPS * STEP_S / _COOLING_S)
-_STRAINED: Final = 0.95  # of full effort
+_STRAINED: Final = 0.95  # fraction of full effort from which on the motor is strained
 
 
 class MotorCommand(NamedTuple):
     """Command of a motor, in ticks and seconds; a profile limit of 0 means unlimited.
 
     Attributes:
-        goal: A position, or a speed when `by_speed`.
+        goal: A position, or a speed if `by_speed`.
         torque: Fraction of its full torque that the motor may use.
     """
 
@@ -53,9 +53,9 @@ class Plant:
 
     Attributes:
         effort: Fraction of full torque that the motor uses now, signed.
-        load: Fraction that holding its position takes.
-        stuck: The shaft does not turn.
-        strained_steps: Steps at full effort without turning.
+        load: Fraction of full torque that is needed to hold its position.
+        stuck: True if the shaft does not turn.
+        strained_steps: Number of steps at full effort without turning.
     """
 
     position: float
@@ -77,7 +77,7 @@ class Plant:
         return self.strained_steps * STEP_S >= OVERLOAD_S
 
     def advance(self, now_s: float, drive: MotorCommand | None) -> None:
-        """Move on to the last grid point at or before `now_s`; going back in time does nothing.
+        """Advance to the last grid point at or before `now_s`; do nothing if that is not later.
 
         `drive` None: no torque, the shaft stays.
         """
@@ -123,7 +123,7 @@ class Plant:
             self.speed = self.acceleration = self.effort = 0.0
 
     def _move(self, drive: MotorCommand, pull: float) -> None:
-        """Make one step of a motor whose controller asks for the acceleration `pull`."""
+        """Advance by one step a motor whose controller demands the acceleration `pull`."""
         full = drive.top_speed / _SPIN_UP_S
         limit = full * drive.torque
         motor = min(max(pull, -limit), limit)
@@ -166,7 +166,7 @@ class Plant:
             self._warm()
 
     def _warm(self) -> None:
-        """Update the temperature, once every `_HEAT_STEPS`, by the effort of all of them."""
+        """Update the temperature from the effort of the last `_HEAT_STEPS` steps; called once in as many steps."""
         target = AMBIENT_C + _HEATING * self._heat / _HEAT_STEPS
         self._heat = 0.0
         self.temperature_C += _DECAY * (target - self.temperature_C)
@@ -174,7 +174,7 @@ class Plant:
             self.temperature_C = AMBIENT_C
 
     def current_mA(self) -> float:
-        """Return a plausible winding current: friction while it turns, and its effort."""
+        """Return a plausible winding current: a part for friction while it turns, and a part for its effort."""
         if self.speed == 0.0 and self.effort == 0.0:
             return 0.0
         friction = _FRICTION_MA * min(max(self.speed / _CREEP, -1.0), 1.0)

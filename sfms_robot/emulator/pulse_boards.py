@@ -1,11 +1,11 @@
 """Emulated hobby-servo boards: bytes of the host in, bytes of the board out. Opens nothing.
 
-A board makes pulses; its servos only follow them and report nothing. So each channel has two parts: the pulse, which
-the board knows and moves under its speed limits, and a shaft, which a plant moves and only a test can see. Nothing
-about the shaft ever reaches the wire.
+A board sends pulses; its servos only follow them and report nothing. So each channel has two parts: the pulse, which
+the board stores and moves under its speed limits, and a shaft, which a plant moves and only a test can read. The state
+of the shaft never reaches the wire.
 
-A servo of the description is one channel with a servo on it; a board all of whose channels are dead is unplugged, one
-all of whose channels are mute obeys and never answers.
+A servo of the description is one channel with a servo on it. A board is unplugged if all its channels are dead. It
+obeys and never answers if all its channels are mute.
 
 Not modelled: the script, serial timeout, PWM output and daisy chain of a Maestro; the inputs, sequencer and offsets
 of an SSC-32.
@@ -26,17 +26,17 @@ from sfms_robot.emulator.register_servo import USUAL_BITS
 from sfms_robot.servo.codecs import maestro, ssc32
 from sfms_robot.servo.registers import Table
 
-_NO_LIMIT: Final = 1e9  # ticks/s; a profile without a speed still needs one to have an acceleration
-_MICRO: Final = 6  # channels of the one Maestro without "set multiple targets"
+_NO_LIMIT: Final = 1e9  # ticks/s; speed of a profile with only an acceleration, which has no effect without a speed
+_MICRO: Final = 6  # channels of the Micro Maestro, the only model without Set Multiple Targets
 _MINI_SSC_NEUTRAL: Final = 127
 _MINI_SSC_STEP: Final = 15  # quarter microseconds: 476.25 us / 127
 _NEUTRAL: Final = 6000
 
 
 class Channel:
-    """One output: its pulse in ticks, and the shaft of the servo behind it, which starts at `start_ticks`."""
+    """One output: its pulse in ticks, and the shaft of the servo on it, which starts at `start_ticks`."""
 
-    fault_bits: Final = USUAL_BITS  # a board has no faults of servos; these bits stand for them
+    fault_bits: Final = USUAL_BITS  # a board does not report faults of servos; these bits represent them
 
     def __init__(self, number: int, board: EmulatedBoard, start_ticks: int) -> None:
         self.id = number
@@ -48,7 +48,7 @@ class Channel:
         self._board = board
 
     def send(self, goal: float, now_s: float) -> None:
-        """Send pulses of `goal` ticks. Where there were none the board knows no speed limit: the pulse jumps."""
+        """Send pulses of `goal` ticks. If there were none, the pulse jumps: the speed limit has no start."""
         self.advance(now_s)
         if not self.on:
             self.plant.reference = goal
@@ -60,7 +60,7 @@ class Channel:
         self.on = False
 
     def advance(self, now_s: float) -> None:
-        """Move pulse and shaft on to `now_s`."""
+        """Advance pulse and shaft to `now_s`."""
         speed = self.speed or (_NO_LIMIT if self.acceleration else 0.0)
         drive = MotorCommand(self.goal, self._board.table.top_speed_ticks_s, speed, self.acceleration)
         self.plant.advance(now_s, drive if self.on else None)
@@ -75,7 +75,7 @@ class Channel:
         self.plant.position = ticks
 
     def state(self, now_s: float) -> Report:
-        """Return what a look at the channel shows, whatever is on the wire."""
+        """Return the true state of the channel, independent of the wire."""
         self.advance(now_s)
         return {
             "position": self.plant.position,
@@ -94,12 +94,12 @@ class Channel:
 
     @property
     def moving(self) -> bool:
-        """A limit still holds the pulse back."""
+        """True while a limit still delays the pulse."""
         return self.on and bool(self.speed or self.acceleration) and self.plant.reference != self.goal
 
 
 class EmulatedBoard(EmulatedDevice):
-    """The part that all boards share. The id of a servo is its channel.
+    """The common part of all boards. The id of a servo is its channel.
 
     Attributes:
         servos: Channels with a servo plugged in.
@@ -115,7 +115,7 @@ class EmulatedBoard(EmulatedDevice):
         self.servos = [channel for channel in self.channels if channel.id in starts]
         self.limits = self._ticks(*table.pulse_us)
         self._buffer = bytearray()
-        self._now_s = 0.0  # while it obeys
+        self._now_s = 0.0  # time, while it executes commands
 
     def advance(self, now_s: float) -> None:
         for channel in self.channels:
@@ -126,7 +126,7 @@ class EmulatedBoard(EmulatedDevice):
         self.errors |= bits
 
     def restart(self, now_s: float) -> None:
-        """Start again after a loss of supply: no pulses, nothing remembered."""
+        """Restart after a loss of supply, without pulses and with all state reset."""
         self._buffer.clear()
         self.errors = 0
         for channel in self.channels:
@@ -149,7 +149,7 @@ class EmulatedBoard(EmulatedDevice):
         return shortest_us / tick_us, longest_us / tick_us
 
     def _send(self, channel: Channel, goal: float) -> None:
-        """Send a target, brought inside the limits of the channel; 0 ends the pulses."""
+        """Send a target, clipped to the limits of the channel; 0 ends the pulses."""
         if goal == 0:
             channel.off(self._now_s)
         else:
@@ -158,9 +158,9 @@ class EmulatedBoard(EmulatedDevice):
 
 
 class MaestroBoard(EmulatedBoard):
-    """A Pololu Maestro as it leaves the factory: it detects its baud rate, home is off, an error sends all home.
+    """A Pololu Maestro with factory settings: it detects its baud rate, home is off, an error sends all channels home.
 
-    "Enable CRC" is on where something stored says so: `crc` of any of its servos.
+    "Enable CRC" is on if it is stored: value `crc` of any of its servos.
     """
 
     def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:
@@ -189,7 +189,7 @@ class MaestroBoard(EmulatedBoard):
         self.baud = None
 
     def fail(self, bits: int, now_s: float) -> None:
-        """Latch error bits; every error sends all channels home, and home is off."""
+        """Latch error bits; every error sends all channels home, which is off."""
         super().fail(bits, now_s)
         self._home(now_s)
 
@@ -242,7 +242,7 @@ class MaestroBoard(EmulatedBoard):
 
 
 class Ssc32Board(EmulatedBoard):
-    """A Lynxmotion SSC-32 with its rate set by jumpers: that of the first servo."""
+    """A Lynxmotion SSC-32. Its rate, set by jumpers, is the rate of the first servo."""
 
     def __init__(self, table: Table, servos: Sequence[EmulatedServo]) -> None:
         super().__init__(table, servos)

@@ -1,12 +1,12 @@
-"""One emulated servo that has a control table: registers with the rules of its firmware, and a motor behind them.
+"""Emulated servo with a control table: registers with the rules of its firmware, and the motor that they drive.
 
-The servo is as unkind as the worst real one: at power-up its goal is the middle of its range, wherever it stands, so a
-host that enables torque before it has set a goal sees a jump. Dynamixel 1.0 and Feetech switch their torque on when a
-goal is written. A locked EEPROM takes a value and forgets it at the next power-up (Feetech), or does not take it and
-reports no error (Dynamixel 1.0). Where the sources are silent the servo does the least helpful thing.
+The servo behaves like the worst real servo. At power-up its goal is the middle of its range, at any position, so it
+jumps if a host enables torque before it has set a goal. Dynamixel 1.0 and Feetech switch their torque on when a goal is
+written. A locked EEPROM accepts a value and loses it at the next power-up (Feetech), or ignores it without an error
+(Dynamixel 1.0). In cases that the sources do not describe, the servo does the least helpful thing.
 
     rule                    Dynamixel 2.0                 Dynamixel 1.0                Feetech
-    bad write               one error number, no change   error bits, no change        no error, the rest is taken
+    bad write               one error number, no change   error bits, no change        no error, the rest is written
     faults                  latched until a reboot        in each status, overload     as Dynamixel 1.0
                                                           until torque is enabled
     supply out of limits    latched                       as long as it lasts          as long as it lasts
@@ -41,14 +41,14 @@ from sfms_robot.servo.codecs import dxl2
 from sfms_robot.servo.registers import Field, Table, Values
 
 WATCHDOG_TICK_S: Final = 0.02
-_CHECK_S: Final = 0.1  # between two looks of the firmware at the load and the temperature of its motor
-_DELAY_TICK_S: Final = 2e-6  # of the return delay
-_BROWN_OUT: Final = 0.7  # of the lowest supply it allows: below that the controller itself stops
-_BAUD_TOLERANCE: Final = 0.03  # what a UART forgives
+_CHECK_S: Final = 0.1  # interval at which the firmware checks the load and the temperature of its motor
+_DELAY_TICK_S: Final = 2e-6  # unit of the return delay
+_BROWN_OUT: Final = 0.7  # fraction of the lowest allowed supply, below which the controller itself stops
+_BAUD_TOLERANCE: Final = 0.03  # rate error that a UART tolerates
 _FULL_TORQUE: Final = 1000
-_NEAR_TICKS: Final = 8.0  # of its goal: a Dynamixel 2.0 reports "in position"
-USUAL_BITS: Final = {"voltage": 0x01, "overheating": 0x04, "overload": 0x20}  # where the firmware map names none
-_SUPPLIES: Final = ((7.5, 5.0), (9.0, 7.4), (16.5, 12.0))  # up to this highest supply [V] -> usual supply [V]
+_NEAR_TICKS: Final = 8.0  # distance from its goal within which a Dynamixel 2.0 reports "in position"
+USUAL_BITS: Final = {"voltage": 0x01, "overheating": 0x04, "overload": 0x20}  # for faults not in the firmware map
+_SUPPLIES: Final = ((7.5, 5.0), (9.0, 7.4), (16.5, 12.0))  # highest allowed supply up to this [V] -> usual supply
 _PENDING: Final = ("registered_instruction", "registered", "async_write_flag")  # 1 from REG WRITE to ACTION
 
 
@@ -56,13 +56,13 @@ class RegisterServo(ABC):
     """A servo that answers instructions. All times are seconds of the wire's clock.
 
     Attributes:
-        dead: Silent, as with its cable out; its motor keeps following its last command.
-        mute: It obeys, and never answers.
-        fault_status: Bits of its faults, as the firmware map numbers them.
+        dead: True if it is silent, as with its cable unplugged; its motor keeps following its last command.
+        mute: True if it obeys, but never answers.
+        fault_status: Bits of its faults, with the numbers of the firmware map.
         plant: The motor; its ticks are those of the shaft.
         group_reads: Instructions to several servos at once that it answers.
         fault_bits: Bit of the voltage, overheating and overload fault, by name.
-        id, second_id, baud, return_delay_s, torque: As the registers say now.
+        id, second_id, baud, return_delay_s, torque: Present values of the registers.
     """
 
     def __init__(self, what: EmulatedServo, table: Table) -> None:
@@ -101,7 +101,7 @@ class RegisterServo(ABC):
     # --- instructions -------------------------------------------------------------------------------------------
 
     def hears(self, baud: int | None, now_s: float) -> bool:
-        """Return whether it understands a host at `baud` now."""
+        """Return whether it can receive from a host at `baud` now."""
         awake = self._powered and not self.dead and now_s >= self._deaf_until_s
         if not awake or self.baud is None or baud is None:
             return False
@@ -112,7 +112,7 @@ class RegisterServo(ABC):
         return not self.mute and self._level >= level
 
     def read(self, address: int, length: int, now_s: float) -> tuple[int, bytes]:
-        """Return (error, data)."""
+        """Read a block of registers; return (error, data)."""
         self.advance(now_s)
         if length == 0 or address + length > len(self._memory.raw):
             return (0 if self._is_feetech else self._beyond), b""
@@ -125,7 +125,7 @@ class RegisterServo(ABC):
         return 0, data
 
     def _measured(self, role: str, now_s: float) -> float | None:
-        """Return the value of a register that is worked out whenever it is read, before it is rounded; else None."""
+        """Return the unrounded value of a register that is computed at every read; None for any other register."""
         plant, sign, drive = self.plant, self.frame.sign, self.drive
         match role:
             case "present_position":
@@ -159,7 +159,7 @@ class RegisterServo(ABC):
         return None
 
     def write(self, address: int, data: bytes, now_s: float) -> int:
-        """Return the error, 0 when the data were taken. A Dynamixel changes nothing unless all of it is allowed."""
+        """Write a block; return the error, 0 if there is none. A Dynamixel writes nothing unless all of it is valid."""
         self.advance(now_s)
         wanted: dict[str, int] = {}
         errors: list[int] = []
@@ -178,19 +178,19 @@ class RegisterServo(ABC):
                     errors.append(error)
                 else:
                     wanted[field.name] = value
-        counted = errors[:1] if self.table.protocol == 2 else errors  # a number, or bits
+        counted = errors[:1] if self.table.protocol == 2 else errors  # one number, or bits
         error = 0 if self._is_feetech else reduce(int.__or__, counted, 0)
         if not error:
             self._apply(wanted)
         return error
 
     def register(self, address: int, data: bytes) -> int:
-        """Keep a write for `action`."""
+        """Store a write for `action`."""
         self._set_registered((address, data))
         return 0
 
     def action(self, now_s: float) -> int:
-        """Carry out the registered write; return the error."""
+        """Execute the registered write; return the error."""
         kept = self._registered
         self._set_registered(None)
         if kept is None:
@@ -198,7 +198,7 @@ class RegisterServo(ABC):
         return self.write(*kept, now_s)
 
     def factory_reset(self, now_s: float, keep: Sequence[str] = ()) -> None:
-        """Set all registers but those of `keep` to their factory values, and restart."""
+        """Set all registers except those in `keep` to their factory values, and restart."""
         self.advance(now_s)
         kept = {name: self._get(name) for name in keep}
         self._reset_registers()
@@ -208,7 +208,7 @@ class RegisterServo(ABC):
         self.power_cycle(now_s)
 
     def forget_turns(self, now_s: float) -> None:
-        """Bring the position into one turn; the shaft stays."""
+        """Reduce the position to one turn; the shaft stays."""
         self.advance(now_s)
         self.plant.position %= self.table.ticks_per_revolution
         self.plant.reference = self.plant.position
@@ -224,7 +224,7 @@ class RegisterServo(ABC):
     # --- events -------------------------------------------------------------------------------------------------
 
     def power_cycle(self, now_s: float) -> None:
-        """Restart: RAM, whole turns, latched faults and what a locked EEPROM did not keep are gone; the shaft stays."""
+        """Restart; RAM, whole turns, latched faults and values not stored (locked EEPROM) are lost. The shaft stays."""
         self.advance(now_s)
         self._memory.raw[:] = self._stored
         self.plant.position %= self.table.ticks_per_revolution
@@ -233,12 +233,12 @@ class RegisterServo(ABC):
         self._power_up()
 
     def fail(self, bits: int, now_s: float) -> None:
-        """Set faults, as bits of `fault_status`; those of the shutdown register take the torque away."""
+        """Set faults, as bits of `fault_status`; faults in the shutdown register switch torque off."""
         self.advance(now_s)
         self._fail(bits)
 
     def set_supply(self, volts: float, now_s: float) -> None:
-        """Change the supply. Too low stops the controller, which restarts when the supply is back."""
+        """Change the supply. If it is too low, the controller stops, and restarts when the supply is back."""
         self.advance(now_s)
         self.supply_v = volts
         was_powered, self._powered = self._powered, volts >= _BROWN_OUT * self._volts("min_voltage_limit")
@@ -250,12 +250,12 @@ class RegisterServo(ABC):
         self._watch_supply()
 
     def turn(self, ticks: float, now_s: float) -> None:
-        """Turn the shaft by hand, to where its position reads `ticks`."""
+        """Turn the shaft by hand to reported position `ticks`."""
         self.advance(now_s)
         self.plant.position = self.frame.shaft(ticks)
 
     def state(self, now_s: float) -> Report:
-        """Return what a look at the servo shows, whatever is on the wire."""
+        """Return the true state of the servo, independent of the wire."""
         self.advance(now_s)
         return {
             "position": self.frame.reported(self.plant.position),
@@ -267,20 +267,20 @@ class RegisterServo(ABC):
         }
 
     def advance(self, now_s: float) -> None:
-        """Move the motor on; where the bus watchdog trips meanwhile, the motor stops there."""
+        """Advance the motor. If the bus watchdog trips meanwhile, it takes effect at that time."""
         trip_s = self._received_at_s + self._watchdog * WATCHDOG_TICK_S
         if self.drive is not None and self._watchdog > 0 and now_s >= trip_s:
             self._advance(trip_s)
             self._put("bus_watchdog", -1)
             self._tripped = True
-            if self.table.watchdog != "flags_only":  # firmware from 53 on stops where it is
+            if self.table.watchdog != "flags_only":  # since firmware 53 the servo stops at its position
                 self._stay()
                 self._put("goal_velocity", 0)
             self._settings()
         self._advance(now_s)
 
     def _advance(self, now_s: float) -> None:
-        """Move the motor on; its firmware looks at it on a fixed grid of time, at whatever times it is read."""
+        """Advance the motor; its firmware checks it on a fixed grid of time, independent of the times of reads."""
         while self._checks * _CHECK_S <= now_s:
             if self.drive is None:
                 self._checks = int(now_s / _CHECK_S) + 1
@@ -296,25 +296,25 @@ class RegisterServo(ABC):
 
     group_reads: set[int]
     _beyond: int  # error of a read beyond the table
-    _unknown: int  # error of a write where there is no register
+    _unknown: int  # error of a write to an address without register
     _nothing_registered = 0
-    _start_s = 0.0  # it neither listens nor answers after power-up
+    _start_s = 0.0  # time after power-up in which it neither receives nor answers
 
     @property
     def alert(self) -> int:
-        """Return what its faults add to the error of every answer."""
+        """Return the bits that its faults add to the error of every answer."""
         return self.fault_status
 
     @abstractmethod
     def _refusal(self, field: Field, value: int | None) -> int:
-        """Return the error of a write to a register, 0 where it is taken. `value`: None for a part of the register."""
+        """Return the error of a write to a register, 0 for none. `value` None: a write of only a part of it."""
 
     def _apply(self, wanted: Values) -> None:
         locked = self._get("lock") == 1
         for name, value in wanted.items():
             field = self.table[name]
             if locked and not self._is_feetech and (field.eeprom or name == "lock"):
-                continue  # a Dynamixel that is locked stays locked until its supply is switched off
+                continue  # a locked Dynamixel stays locked until its supply is switched off
             if name == "goal_position" and self._is_feetech and self._mode is Mode.JOINT:  # clipped, not refused
                 value = min(max(value, self._lowest), self._highest) if self._lowest < self._highest else value
             self._put(name, value)
@@ -325,7 +325,7 @@ class RegisterServo(ABC):
             self._torque_written(wanted[torque.name], locked)
         elif "goal_position" in wanted and self._goal_enables and not self.torque and not self._shut_down():
             self._put("torque_enable", 1)
-        elif not self._by_time and wanted.keys() == {"goal_position"}:  # comes in every tick
+        elif not self._by_time and wanted.keys() == {"goal_position"}:  # the write of every tick
             if self.drive is not None and self._mode in POSITIONING:
                 goal = self.frame.shaft(float(self._get("goal_position")))
                 stepped = self._stepped(wanted["goal_position"])
@@ -336,21 +336,21 @@ class RegisterServo(ABC):
             self._watch_supply()
 
     def _stay(self) -> None:
-        """Set the goal to where it stands."""
+        """Set the goal to the present position."""
         self._put("goal_position", round(self.frame.reported(self.plant.position)))
 
     def _keep(self, field: Field) -> None:
-        """Keep a register over the next power-up."""
+        """Store a register, so that it survives the next power-up."""
         end = field.address + field.size
         self._stored = self._stored[: field.address] + bytes(self._memory.raw[field.address : end]) + self._stored[end:]
 
     def _stepped(self, step: int) -> float:
-        """Return where the steps written so far and another one lead in step mode, in shaft ticks."""
+        """Return the goal of the steps written so far and another step in step mode, in shaft ticks."""
         start = self.drive.goal if self.drive is not None and self._mode is Mode.STEP else self.plant.position
         return start + step
 
     def _torque_written(self, value: int, locked: bool) -> None:
-        """Do what else a write to torque enable does."""
+        """Apply the other effects of a write to torque enable."""
         return
 
     def _set_registered(self, write: tuple[int, bytes] | None) -> None:
@@ -385,7 +385,7 @@ class RegisterServo(ABC):
             if not field.eeprom:
                 self._put(field.name, field.initial)
         self._put("torque_enable", 0)
-        self._put("goal_position", self.table.center_ticks)  # the least helpful goal: torque would be a jump
+        self._put("goal_position", self.table.center_ticks)  # the least helpful goal: with torque it jumps
         self._put("torque_limit", self._get("max_torque") or _FULL_TORQUE)
         self._settings()
         self._watch_supply()
@@ -400,7 +400,7 @@ class RegisterServo(ABC):
         self._put("endianness_flag", int(self.table.byte_order == "big"))
 
     def _settings(self, step: int = 0) -> None:
-        """Take over what the registers say now. `step`: was written just now, in step mode."""
+        """Update all settings from the registers. `step`: a step that has just been written, in step mode."""
         get, stepped = self._get, self._stepped(step)
         self.id = get("id")
         second = get("secondary_id", 255)
@@ -411,7 +411,7 @@ class RegisterServo(ABC):
         self.torque = get("torque_enable")
         self._watchdog, self._hottest_C = get("bus_watchdog"), get("temperature_limit")
         self._lowest, self._highest = angle_limits(self._memory)
-        # Drive mode (10) of Protocol 2.0; the others always switch torque on by a goal.
+        # Only Protocol 2.0 has drive mode (10); all other servos always switch torque on by a goal.
         drive_mode = get("drive_mode") if self.table.protocol == 2 else TORQUE_ON_BY_GOAL
         self._goal_enables, self._by_time = bool(drive_mode & TORQUE_ON_BY_GOAL), bool(drive_mode & 0x04)
         self._mode = mode_of(self._memory)

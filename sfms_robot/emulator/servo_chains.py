@@ -1,8 +1,9 @@
 """Emulated servos of one wire that share a protocol: packets in, packets out. Opens nothing.
 
-An instruction to an id that no servo has stays unanswered, and only servos set to the host's baud rate receive it. On
-a sync or bulk read each servo waits for the one before it: behind a silent id all are silent, or, with `chain_break`
-False, the others answer. Two servos with one id obey both; Dynamixels of Protocol 2.0 then talk at the same time.
+An instruction to an id without a servo is not answered, and only servos set to the host's baud rate receive it. In a
+sync or bulk read each servo waits for the previous servo: after a silent id all servos are silent, or, with
+`chain_break` False, the others answer. Two servos with one id both obey; Dynamixels of Protocol 2.0 then answer at the
+same time.
 """
 
 from __future__ import annotations
@@ -21,14 +22,14 @@ from sfms_robot.servo.registers import Field, Table, Values
 
 FAST_BULK_READ: Final = 0x9A
 _FAST_READS: Final = {dxl2.FAST_SYNC_READ, FAST_BULK_READ}
-_GAP_S: Final = 0.05  # an unfinished packet older than this is forgotten
-_FAST_FIRMWARE: Final = 45  # from here on a servo knows fast reads
+_GAP_S: Final = 0.05  # age at which an incomplete packet is dropped
+_FAST_FIRMWARE: Final = 45  # first firmware that supports fast reads
 _CENTER_ON_STS: Final = 2048
 _LIMITED: Final = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
 _RESET_BY_MODE: Final = ("profile_velocity", "profile_acceleration", "goal_velocity", "goal_pwm", "goal_current")
 _CLEAR_TURNS: Final = b"\x01\x44\x58\x4c\x22"  # parameters of CLEAR
 _RESULT_FAIL: Final = 1
-_REBOOT_S: Final = 0.3  # a Dynamixel 2.0 neither listens nor answers after a reboot
+_REBOOT_S: Final = 0.3  # time after a reboot in which a Dynamixel 2.0 neither receives nor answers
 S = TypeVar("S", bound=RegisterServo)
 T = TypeVar("T")
 Request = tuple[int, int, T]  # id, address, and length or data
@@ -37,7 +38,7 @@ Request = tuple[int, int, T]  # id, address, and length or data
 class ServoChain(EmulatedDevice, Generic[S]):
     """The servos of one protocol. `tables` by model.
 
-    While it obeys, `_now_s` is the time, and `_listening` the servos that receive the packet, by id.
+    While a packet is executed, `_now_s` is the time, and `_listening` the servos that receive the packet, by id.
     """
 
     _servo_class: type[S]
@@ -45,7 +46,7 @@ class ServoChain(EmulatedDevice, Generic[S]):
     _decode: Callable[[bytearray], Any]  # takes a whole packet off the front of a buffer, or returns None
     _encode: Callable[[int, int, bytes], bytes]  # returns a status packet: id, error, data
     _bulk_write: int | None = None  # an instruction of Protocol 2.0
-    _slot_s = 0.0  # answers to a broadcast come in the order of ids, each in its own slot
+    _slot_s = 0.0  # time slot per id: answers to a broadcast come in the order of ids, each in its own slot
 
     def __init__(self, servos: Sequence[EmulatedServo], tables: Mapping[str, Table], chain_break: bool) -> None:
         self.servos: list[S] = [self._servo_class(servo, tables[servo.model]) for servo in servos]
@@ -62,7 +63,7 @@ class ServoChain(EmulatedDevice, Generic[S]):
         return list(self._obey_all(baud))
 
     def _obey_all(self, baud: int | None) -> Iterator[Reply]:
-        """Yield the answers to the whole packets in the buffer, which are taken out of it."""
+        """Remove the whole packets from the buffer; yield the answers to them."""
         while (packet := self._decode(self._buffer)) is not None:
             self._listening = {}
             for servo in self.servos:
@@ -70,20 +71,20 @@ class ServoChain(EmulatedDevice, Generic[S]):
                     servo.feed_watchdog(self._now_s)
                     self._listening.setdefault(servo.id, []).append(servo)
             if not self._listening:
-                self._buffer.clear()  # noise of another baud
+                self._buffer.clear()  # noise from another baud rate
             try:
                 yield from self._answers(*packet[:3])
             except IndexError:
-                continue  # parameters are missing: no servo knows what was meant
+                continue  # parameters are missing: no servo can execute the packet
 
     def _answers(self, target: int, code: int, params: bytes) -> Iterator[Reply]:
         """Yield the answers to a packet: id, instruction, parameters."""
         listening = self._listening
-        followers: dict[int, list[S]] = {}  # the second id of a servo obeys, and never answers
+        followers: dict[int, list[S]] = {}  # a servo obeys its second id, but never answers to it
         for servo in itertools.chain(*listening.values()):
             if servo.second_id is not None:
                 followers.setdefault(servo.second_id, []).append(servo)
-        if code in (dxl2.SYNC_WRITE, self._bulk_write):  # nothing answers
+        if code in (dxl2.SYNC_WRITE, self._bulk_write):  # no servo answers
             parts = self._sync_writes(params) if code == dxl2.SYNC_WRITE else self._bulk_writes(params)
             for servo_id, address, data in parts:
                 for servo in (*listening.get(servo_id, ()), *followers.get(servo_id, ())):
@@ -111,7 +112,7 @@ class ServoChain(EmulatedDevice, Generic[S]):
     def _reads(self, requests: Sequence[Request[int]], code: int) -> Iterator[Reply]:
         """Yield status packets in list order, up to the first id that is silent (unless the chain skips it).
 
-        The one packet of a fast read is announced whole, and stops short at the first servo that is silent.
+        The length in the single packet of a fast read is for all servos; the packet ends before the first silent servo.
         """
         fast, pause_s = code in _FAST_READS, 0.0
         parts: list[tuple[int, int, bytes]] = []
@@ -128,23 +129,23 @@ class ServoChain(EmulatedDevice, Generic[S]):
             else:
                 replies = [self._status(servo, servo_id, error, data) for servo, error, data in answers]
                 yield from self._together(replies)
-        announced = 1 + sum(length + 4 for *_, length in requests)  # LEN: as far as the last servo of the list
+        announced = 1 + sum(length + 4 for *_, length in requests)  # LEN: up to the last servo of the list
         if parts and announced < dxl2.MAX_PACKET + 1:
             yield Reply(tuple(part[0] for part in parts), dxl2.encode_fast_status(parts, announced), pause_s)
 
     @abstractmethod
     def _single(self, servo: S, code: int, params: bytes, broadcast: bool = False) -> Reply | None:
-        """Let one servo obey an instruction; return its answer, if any, under the id that it had."""
+        """Let one servo execute an instruction; return its answer, if any, with the id that it had before."""
 
     def _status(self, servo: S, servo_id: int, error: int, data: bytes = b"") -> Reply:
         return Reply((servo_id,), self._encode(servo_id, error | servo.alert, data), servo.return_delay_s)
 
     def _together(self, answers: Sequence[Reply | None]) -> Iterator[Reply]:
-        """Yield what the wire carries of the answers of all servos of one id."""
+        """Yield the packets that appear on the wire when all servos with one id answer."""
         yield from filter(None, answers)
 
     def _number(self, params: bytes, index: int) -> int:
-        """Return an address or a length. Raises IndexError where it is missing."""
+        """Return an address or a length. Raises IndexError if it is missing."""
         return sum(params[index * self._width + i] << 8 * i for i in range(self._width))
 
     def _sync_writes(self, params: bytes) -> Iterator[Request[bytes]]:
@@ -161,7 +162,7 @@ class ServoChain(EmulatedDevice, Generic[S]):
             params = params[5 + length :]
 
     def _common(self, servo: S, code: int, params: bytes) -> tuple[int, bytes, int] | None:
-        """Return (error, data, status return level of the answer) of an instruction of every family; else None."""
+        """Execute an instruction of every family, else return None; return (error, data, status level of answer)."""
         if code == protocol1.READ:
             return *servo.read(self._number(params, 0), self._number(params, 1), self._now_s), 1
         if code == protocol1.WRITE:
@@ -175,7 +176,7 @@ class ServoChain(EmulatedDevice, Generic[S]):
 
 
 class Dynamixel2Servo(RegisterServo):
-    """A Dynamixel of Protocol 2.0. Errors are numbers; EEPROM is closed under torque; goals are held to limits."""
+    """A Dynamixel of Protocol 2.0: numbered errors, no EEPROM writes under torque, no goals beyond limits."""
 
     _beyond, _unknown = dxl2.DATA_RANGE_ERROR, dxl2.ACCESS_ERROR
     _start_s = _REBOOT_S
@@ -191,7 +192,7 @@ class Dynamixel2Servo(RegisterServo):
         return dxl2.ALERT if self.fault_status else 0
 
     def clear(self, params: bytes, now_s: float) -> int:
-        """Forget whole turns, only at rest; return the error."""
+        """Clear the count of turns, only at rest; return the error."""
         self.advance(now_s)
         if params != _CLEAR_TURNS:
             return dxl2.DATA_RANGE_ERROR
@@ -242,7 +243,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
         return [(row[0], self._number(row[1:], 0), self._number(row[1:], 1)) for row in rows]
 
     def _together(self, answers: Sequence[Reply | None]) -> Iterator[Reply]:
-        """Yield the one packet that comes of all: they talk at once."""
+        """Yield the single packet that results when all servos answer at the same time."""
         if packets := list(filter(None, answers)):
             yield packets[0]._replace(data=_collided([packet.data for packet in packets]))
 
@@ -254,11 +255,11 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
             result = 0, number.to_bytes(2, "little") + bytes([servo.firmware]), 0
         elif code == dxl2.STATUS or (code == dxl2.READ and broadcast):
             return None
-        elif code in (dxl2.REBOOT, dxl2.FACTORY_RESET):  # answered first, in the state that it is in
+        elif code in (dxl2.REBOOT, dxl2.FACTORY_RESET):  # answered before they are executed
             reply = self._status(servo, servo_id, 0) if servo.answers(2) and not broadcast else None
             if code == dxl2.REBOOT:
                 servo.power_cycle(now_s)
-            elif not (broadcast and params[0] == 0xFF):  # ignored since firmware 42: all would have one id
+            elif not (broadcast and params[0] == 0xFF):  # ignored since firmware 42: all would get the same id
                 servo.factory_reset(now_s, {1: ("id",), 2: ("id", "baud_rate")}.get(params[0], ()))
             return reply
         elif code == dxl2.CLEAR:
@@ -272,7 +273,7 @@ class Dynamixel2Chain(ServoChain[Dynamixel2Servo]):
 
 
 def _collided(packets: Sequence[bytes]) -> bytes:
-    """Return what the wire carries when several talk at once: low wins, bit by bit."""
+    """Return the bytes on the wire when several servos send at the same time: of each bit, low wins."""
     length = max(map(len, packets))
     wide = (int.from_bytes(packet.ljust(length, b"\xff"), "big") for packet in packets)
     return reduce(int.__and__, wide).to_bytes(length, "big")
@@ -289,8 +290,8 @@ class Protocol1Servo(RegisterServo):
     def __init__(self, what: EmulatedServo, table: Table) -> None:
         is_feetech = table.family == "feetech"
         self._nothing_registered = 0 if is_feetech else protocol1.INSTRUCTION
-        # MX knows bulk read, AX does not; their tables differ in the multi-turn registers. STS knows sync read, the
-        # turn counter and the calibration of its middle, SCS does not.
+        # MX supports bulk read, AX does not; their tables differ in the multi-turn registers. STS supports sync read,
+        # the turn counter and the calibration of its middle, SCS does not.
         self.is_sts = is_feetech and table.byte_order == "little"
         self.group_reads = {protocol1.SYNC_READ} if self.is_sts else set()
         if not is_feetech and "multi_turn_offset" in table.fields:
@@ -300,7 +301,7 @@ class Protocol1Servo(RegisterServo):
     def _refusal(self, field: Field, value: int | None) -> int:
         if value is None or not field.writable:
             return protocol1.RANGE
-        # Register 44 of a Feetech is a time, and in PWM mode a duty with a sign bit.
+        # Register 44 of a Feetech is a time, and in PWM mode a duty cycle with a sign bit.
         signed_duty = field.name == "goal_time" and self._mode is Mode.PWM
         if not (-field.high if signed_duty else field.low) <= value <= field.high:
             return protocol1.RANGE
@@ -311,7 +312,7 @@ class Protocol1Servo(RegisterServo):
         return 0
 
     def _torque_written(self, value: int, locked: bool) -> None:
-        """Take the present position for the middle at 128 (Feetech); clear an overload when torque comes on."""
+        """Make the present position the middle if 128 is written (Feetech); clear an overload when torque comes on."""
         if value == protocol1.CALIBRATE_HERE and "homing_offset" in self.table.fields:
             self._put("homing_offset", round(self.plant.position % self.table.ticks_per_revolution) - _CENTER_ON_STS)
             if not locked:
@@ -335,12 +336,12 @@ class Protocol1Chain(ServoChain[Protocol1Servo]):
     _decode, _encode = staticmethod(protocol1.maybe_frame), staticmethod(protocol1.encode)
 
     def _bulk_reads(self, params: bytes) -> list[Request[int]]:
-        # behind the 00: length, id, address of each
+        # after the 00: length, id, address of each
         return [(params[i + 1], params[i + 2], params[i]) for i in range(1, len(params) - 2, 3)]
 
     def _single(self, servo: Protocol1Servo, code: int, params: bytes, broadcast: bool = False) -> Reply | None:
         servo_id, now_s, is_feetech = servo.id, self._now_s, servo.table.family == "feetech"
-        answers = [servo.answers(level) for level in range(3)]  # as the request finds it
+        answers = [servo.answers(level) for level in range(3)]  # before the request changes the level
         error, data, level = 0, b"", 2
         if (result := self._common(servo, code, params)) is not None:
             error, data, level = result

@@ -1,6 +1,6 @@
 """An emulated microphone: a PulseAudio server with null sinks, which PortAudio reaches through ALSA.
 
-The monitor of a sink records the sound that is played to it. Unplugging is unloading the sink.
+The monitor of a sink records the sound that is played to it. The microphone is unplugged by unloading the sink.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Final
 
 DEBIAN: Final = "pulseaudio pulseaudio-utils libasound2-plugins libportaudio2"
 ALSA: Final = "pcm.!default { type pulse }\nctl.!default { type pulse }\n"
-_LIMIT_S: Final = 60.0  # of one command to the server
+_LIMIT_S: Final = 60.0  # longest duration of one command to the server
 
 
 class SoundServer:
-    """A server in `folder`; with `environment` programs find it, and no other. Linux only.
+    """A server in `folder`. Programs started with `environment` find this server and no other. Linux only.
 
-    Every method blocks until the server has done its work, and raises CalledProcessError when it cannot.
+    Every method except `play` blocks until the server has done its work, and raises CalledProcessError if it fails.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -41,7 +41,7 @@ class SoundServer:
         self._run("pulseaudio", "-n", "--daemonize=yes", "--exit-idle-time=-1", *(f"--load={each}" for each in modules))
 
     def stop(self) -> None:
-        """End it, and wait until it has ended."""
+        """End the server, and wait until it has ended."""
         pid = int((Path(self.environment["XDG_RUNTIME_DIR"]) / "pulse" / "pid").read_text(encoding="utf-8"))
         ended = os.pidfd_open(pid)
         os.kill(pid, signal.SIGTERM)
@@ -53,7 +53,7 @@ class SoundServer:
         self.load("module-null-sink", f"sink_name={sink}")
 
     def unplug(self, sink: str) -> None:
-        """Unload the sink; a program that records it receives nothing more, where there is no other sink."""
+        """Unload the sink; a program that records it receives nothing more if there is no other sink."""
         modules = self._run("pactl", "list", "short", "modules").splitlines()
         (module,) = [line.split()[0] for line in modules if f"sink_name={sink}" in line]
         self._run("pactl", "unload-module", module)

@@ -18,15 +18,15 @@ from sfms_robot.frames import Doubles, Floats
 
 INK: Final = (0.16, 0.17, 0.20)
 BACKGROUND: Final = (0.905, 0.915, 0.925)
-PLACE_M: Final = (0.6, 0.0, 0.0)  # of the virtual webcam's person: arm's length, in the middle of the picture
-ANGLE_DEG: Final = 45.0  # across the picture's height: a common webcam
+PLACE_M: Final = (0.6, 0.0, 0.0)  # place of the virtual webcam's person: arm's length, in the middle of the picture
+ANGLE_DEG: Final = 45.0  # view angle across the picture's height, as of a common webcam
 SIZE_PX: Final = (640, 480)
-_EYES_M: Final = (0.09, 0.0, 0.032)  # of the head at rest
-_DIRECTION: Final = np.array([1.0, 0.42, 0.22]) / np.linalg.norm([1.0, 0.42, 0.22])  # of the camera, from the robot
+_EYES_M: Final = (0.09, 0.0, 0.032)  # eyes of the head at rest
+_DIRECTION: Final = np.array([1.0, 0.42, 0.22]) / np.linalg.norm([1.0, 0.42, 0.22])  # from the robot to the camera
 _ANGLE_DEG: Final = 24.0
-_ROOM: Final = 1.12  # of a picture, by what it shows
+_ROOM: Final = 1.12  # size of a picture divided by that of its content
 _LIGHTS: Final = (((2.0, 1.0, 2.0), 0.72), ((2.2, -2.0, 0.2), 0.42), ((-1.0, 2.0, 2.0), 0.30))
-# Each shape of a URDF: vtk's name of it and of its sizes, and its number of corners.
+# Each shape of a URDF: vtk's names of the shape and of its sizes, and the number of its corners.
 _SHAPES: Final[Mapping[str, tuple[str, tuple[str, ...], Mapping[str, int]]]] = {
     "box": ("Cube", ("x_length", "y_length", "z_length"), {}),
     "sphere": ("Sphere", ("radius",), {"theta_resolution": 48, "phi_resolution": 24}),
@@ -47,7 +47,7 @@ def load_vtk() -> Any:
         import vtkmodules.vtkRenderingOpenGL2  # noqa: F401
         from vtkmodules import vtkCommonCore, vtkCommonDataModel, vtkFiltersCore, vtkIOImage, vtkRenderingCore
         from vtkmodules.util import numpy_support
-    vtkCommonCore.vtkLogger.SetStderrVerbosity(vtkCommonCore.vtkLogger.VERBOSITY_ERROR)  # not of a missing display
+    vtkCommonCore.vtkLogger.SetStderrVerbosity(vtkCommonCore.vtkLogger.VERBOSITY_ERROR)  # no warning without a display
     names: dict[str, Any] = {"arrays": numpy_support}
     for module in (vtkCommonCore, vtkCommonDataModel, vtkFiltersCore, vtkIOImage, vtkRenderingCore):
         names |= {name.removeprefix("vtk"): getattr(module, name) for name in dir(module) if name.startswith("vtk")}
@@ -100,7 +100,7 @@ def add_text(vtk: Any, renderer: Any, text: str, place_px: tuple[int, int], size
 
 
 def look(renderer: Any, from_m: Point, to_m: Point, angle_deg: float) -> None:
-    """Place the camera, in the axes of the scene; `angle_deg` is what it sees across the height of the picture."""
+    """Place the camera, in the axes of the scene; `angle_deg`: view angle across the height of the picture."""
     camera = renderer.active_camera
     camera.view_angle, camera.view_up = angle_deg, (0, 0, 1)
     camera.focal_point, camera.position = tuple(to_m), tuple(from_m)
@@ -115,13 +115,13 @@ def save(vtk: Any, window: Any, file: Path | str) -> None:
 
 
 def _image(vtk: Any, window: Any) -> Any:
-    """Render, and return the filter that gives the picture."""
+    """Render, and return the filter that holds the picture."""
     window.Render()
     return vtk.WindowToImageFilter(input=window, read_front_buffer=False)
 
 
 class VirtualWebcam:
-    """A camera with the virtual human before it: pictures with a known face, to try what reads faces from pictures.
+    """A camera in front of the virtual human: pictures with a known face, to test code that reads faces from pictures.
 
     The person looks straight ahead at rest. Raises MissingExtra without vtk.
     """
@@ -132,15 +132,15 @@ class VirtualWebcam:
         self._human = load_human()
 
     def picture(self, motion: Floats, place_m: tuple[float, float, float] = PLACE_M) -> NDArray[np.uint8]:
-        """(H, W, 3) red, green, blue, not mirrored.
+        """Return a picture (H, W, 3) of red, green and blue, not mirrored.
 
-        motion: (58,) of the person. place_m: the eyes at rest, from the camera: x out of its lens, y to its left, z up;
-        the lens looks straight along its x, and the person along the same line towards it.
+        motion: (58,) of the person. place_m: the eyes at rest, from the camera: x out of its lens, y to its left, z up.
+        The lens looks straight along its x, and the person along the same line towards it.
         """
         vtk = self._vtk
         renderer = add_renderer(vtk, self._window, (0, 0, 1, 1), BACKGROUND)
         add_head(vtk, renderer, self._human, motion)
-        # The person looks the other way: their left is the camera's right.
+        # The person faces the camera: their left is the camera's right.
         away, left, up = place_m
         lens = (_EYES_M[0] + away, _EYES_M[1] + left, _EYES_M[2] - up)
         look(renderer, lens, (lens[0] - 1.0, lens[1], lens[2]), ANGLE_DEG)
@@ -180,7 +180,7 @@ def render_robots(
 
 
 def add_robot(vtk: Any, renderer: Any, scene: RobotScene, values: Doubles) -> None:
-    """Add every visual in its place, three lights, and the camera before it.
+    """Add every visual in its place, three lights, and the camera in front of the robot.
 
     The camera stands where it sees all of the robot at rest, so pictures of one robot show how it moves.
     """
@@ -233,7 +233,7 @@ def _visual_actor(vtk: Any, visual: Visual, place: Doubles, meshes: Mapping[str,
 
 
 def _upright(visual: Visual) -> Doubles:
-    """Return (4, 4) from vtk's shape to the URDF's: its cylinders lie along z, vtk's along y; a mesh has a scale."""
+    """Return (4, 4) from vtk's shape to the URDF's: cylinders of vtk lie along y, not z, and a mesh has a scale."""
     out = np.eye(4)
     if visual.shape == "cylinder":
         out[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
@@ -258,7 +258,7 @@ def _mesh(file: Path) -> Any:
     if name is None:
         raise ConfigError(f"{file}: a picture needs one of {', '.join(_READERS)}")
     reader = getattr(vtkIOPLY if name == "PLYReader" else vtkIOGeometry, f"vtk{name}")(file_name=str(file))
-    for part in (reader, reader.GetExecutive()):  # of a part with an observer vtk prints no error
+    for part in (reader, reader.GetExecutive()):  # vtk prints no error of a part with an observer
         part.AddObserver("ErrorEvent", lambda *_: None)
     reader.Update()
     if reader.GetErrorCode() or not reader.GetOutput().GetNumberOfPoints():

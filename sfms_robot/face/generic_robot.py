@@ -1,8 +1,9 @@
 """The picture of a head without a URDF of its own: a ball on a neck, and a part of the face for each joint.
 
-The neck turns by forward kinematics where the head has `kinematics`, else by the joints that follow roll, pitch and
-yaw. Every other joint turns a part that stands where the channels of its drive are in a face; joints of the same place
-stand below one another, and a joint without a drive is a bar on top. Sizes are those of a small robot head, in metres.
+The neck turns by forward kinematics if the head has `kinematics`, otherwise by the joints that follow roll, pitch and
+yaw. Every other joint turns a part at the place that the channels of its drive have in a face. Joints of the same place
+are drawn below one another, and a joint without a drive is a bar on top. Sizes are those of a small robot head, in
+metres.
 """
 
 from __future__ import annotations
@@ -14,12 +15,12 @@ from xml.sax.saxutils import quoteattr
 from sfms_robot.config import Head
 from sfms_robot.config.head import drives
 
-_AXES: Final = {"yaw": "0 0 1", "pitch": "0 1 0", "roll": "1 0 0"}  # of the neck, from the base up
+_AXES: Final = {"yaw": "0 0 1", "pitch": "0 1 0", "roll": "1 0 0"}  # axes of the neck, from the base up
 _NECK_M: Final = 0.09  # height of its lowest joint
-_STACK_M: Final = 0.013  # between two parts of one place
+_STACK_M: Final = 0.013  # distance between two parts of one place
 _EYE: Final = '<sphere radius="0.011"/>'
 _SKIN: Final = "0.78 0.76 0.72"
-# What channels begin with: place of the left part, its shape, axis, colour.
+# Beginnings of channel names; place of the left part, its shape, axis, colour.
 _PARTS: Final = (
     (("eyeLookIn", "eyeLookOut"), (0.066, 0.028, 0.098), _EYE, "0 0 1", "0.95 0.95 0.93"),
     (("eyeLook",), (0.066, 0.028, 0.098), _EYE, "0 1 0", "0.95 0.95 0.93"),
@@ -34,7 +35,7 @@ _PARTS: Final = (
 
 
 def generic_urdf(head: Head) -> bytes:
-    """Return a URDF whose joints have the names of the head's, or of its pose (`face.robot_scene`)."""
+    """Return a URDF whose joints have the names of the head's joints, or of its pose (`face.robot_scene`)."""
     foot = _visual('<box size="0.1 0.12 0.02"/>', "0 0 0.01", _SKIN)
     post = _visual('<cylinder radius="0.016" length="0.08"/>', "0 0 0.06", _SKIN)
     elements = [f'<link name="base">{foot}{post}</link>']
@@ -56,7 +57,7 @@ def generic_urdf(head: Head) -> bytes:
         row = next(rows, len(_PARTS) - 1)
         _, (x, y, z), shape, axis, color = _PARTS[row]
         side = 1 if "left" in name or name.endswith("_l") else -1 if "right" in name or name.endswith("_r") else 0
-        if shape == _EYE and not side:  # a joint of both eyes: a bar between them, not a third one
+        if shape == _EYE and not side:  # a joint of both eyes: a bar between them, not a third eye
             shape = '<box size="0.006 0.03 0.005"/>'
         place = (x, side * y, z - _STACK_M * taken[row, side])
         taken[row, side] += 1
@@ -75,7 +76,7 @@ def _visual(shape: str, place: str, color: str) -> str:
 
 
 def _part(name: str, parent: str, link: str, place: tuple[float, float, float], axis: str, *visuals: str) -> str:
-    """Return a link, and the joint on which it hangs; without an `axis` that is fixed."""
+    """Return a link, and the joint that holds it; without an `axis` the joint is fixed."""
     kind = f'type="continuous"><axis xyz="{axis}"/>' if axis else 'type="fixed">'
     return (
         f"<link name={quoteattr(link)}>{''.join(visuals)}</link>\n"

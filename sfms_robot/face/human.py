@@ -25,7 +25,7 @@ from sfms_robot.signals.rotations import rotation
 
 FOLDER: Final = data_dir("sim") / "heads" / "human"
 _PIVOT_M: Final = np.array([-0.012, 0.0, -0.065])
-_UNDER_SKIN: Final = round(0.3 * 255)  # of `open_sky`: hair that comes out again where the neck is thin is left out
+_UNDER_SKIN: Final = round(0.3 * 255)  # hair up to this `open_sky` is left out: it would come out at the thin neck
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +35,7 @@ class HumanHead:
     Attributes:
         rest: (V, 3) metres.
         deltas: (52, V, 3) metres, in the order of `frames.BLENDSHAPES`.
-        share: (V,) 0..1, how much of the head's rotation a vertex takes part in.
+        share: (V,) 0..1, the share of the head's rotation that a vertex makes.
         triangles: (T, 3) vertex numbers.
         colors: (V, 3) uint8.
     """

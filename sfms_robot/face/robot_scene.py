@@ -1,13 +1,13 @@
-"""The picture of a robot: its URDF, and the values of that URDF's joints for the angles that the servos read.
+"""The picture of a robot: its URDF, and the values of that URDF's joints for the angles that the servos report.
 
-A joint of the URDF follows the joint of the head that has its name, or the one that `urdf.joints` of the head's file
-gives it; its value is that angle [rad]. What slides, and what several parts do at once, are `mimic` joints of the file.
+A joint of the URDF follows the head's joint of the same name, or the one that `urdf.joints` of the head's file assigns
+to it; its value is that angle [rad]. Parts that slide, or that move together, are `mimic` joints of the file.
 A neck whose servos do not turn the head's axes themselves (a platform, a differential) moves the joints
 
     pose_x, pose_y, pose_z [m], pose_roll, pose_pitch, pose_yaw [rad]     the head's pose against the base
     LEG_rod_swing, LEG_rod_lean [rad]                                     the rod of a platform's leg
 
-by forward kinematics, where the URDF has joints of these names. All other joints stay at 0.
+by forward kinematics, if the URDF has joints of these names. All other joints stay at 0.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _POSE: Final = tuple(f"pose_{channel}" for channel in POSE_CHANNELS)
 
 
 class ForwardNeck(Protocol):
-    """The part of a neck (`retarget.kinematics.Neck`) that a scene uses."""
+    """The part of a neck (`retarget.head_retargeter.Neck`) that a scene uses."""
 
     @property
     def joints(self) -> Sequence[str]: ...
@@ -46,18 +46,18 @@ class ForwardNeck(Protocol):
     def turns_body(self) -> bool: ...
 
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
-        """Angles (..., J) in the order of `joints`, a pose (..., 6) nearby -> poses (..., 6), NaN where none fits."""
+        """Return poses (..., 6) for angles (..., J) of `joints`, NaN if none fits. `start`: a pose nearby (..., 6)."""
 
 
 class RobotScene:
     """A head as a URDF.
 
     Attributes:
-        urdf: the file. generic: it is made of the joints of a head that has none.
-        text: what the page shows: the file, where nothing is left out.
-        robot: what it holds, without the visuals of `left_out`.
+        urdf: the file. generic: whether it is made of the joints of a head without a URDF.
+        text: the URDF that the page shows: that of the file, if nothing is left out.
+        robot: the content of the URDF, without the visuals of `left_out`.
         meshes: file name of a mesh as the URDF has it -> the file, links followed; empty for primitive shapes.
-        left_out: one line for each part that is not drawn, or probably not meant so.
+        left_out: one line for each part that is not drawn, or is probably wrong.
         joints: the URDF joints of `values`, in its order; mimic joints follow from them.
         follows: joint of the head -> the URDF joint that it moves.
         undriven: joints of the head that move nothing in the picture.
@@ -66,7 +66,7 @@ class RobotScene:
     def __init__(self, head: Head, file: Path | None, neck: ForwardNeck | None, packages: Sequence[str]) -> None:
         """Read a URDF; `file` None: make a generic one. See `of`.
 
-        Raises ConfigError of one line: it is broken, or a joint that is named for it is not in it.
+        Raises ConfigError, in one line, if it is broken, or lacks a joint that the head's file names.
         """
         description = head.urdf or RobotDescription(file=URDF_FILE)
         text, urdf = (generic_urdf(head), Path("generic.urdf")) if file is None else (None, file)
@@ -97,16 +97,16 @@ class RobotScene:
 
     @classmethod
     def of(cls, head: Head, neck: ForwardNeck | None = None, packages: Sequence[str] = ()) -> RobotScene:
-        """Return the scene of a head, a generic one where it is not shipped and has no `urdf`. Raises ConfigError.
+        """Return the scene of a head, a generic one if it is not shipped and has no `urdf`. Raises ConfigError.
 
         Args:
             neck: the head's forward kinematics, for a platform or a differential.
-            packages: folders outside the head's that meshes may come from.
+            packages: folders, besides the head's own, that meshes may come from.
         """
         return cls(head, urdf_file(head), neck, packages)
 
     def _find_meshes(self, own: Path, named: Mapping[str, str], folders: Sequence[str]) -> None:
-        """Fill `meshes` and `left_out`. `own`: the head's folder; `named`: folders of packages, from there on."""
+        """Fill `meshes` and `left_out`. `own`: the head's folder; `named`: folders of packages, relative to it."""
         inside = [Path(os.path.realpath(each)) for each in (own, *map(Path, folders))]
         packages = {folder.name: folder for folder in inside[1:]} | {name: own / path for name, path in named.items()}
         for visual in self.robot.visuals:
@@ -118,14 +118,14 @@ class RobotScene:
                     self.meshes[visual.mesh] = file
 
     def leave_out(self, visual: Visual, problem: str) -> None:
-        """Take a mesh out of the picture, and name it in `left_out`."""
+        """Remove a mesh from the picture, and add a line about it to `left_out`."""
         self.left_out.append(f"{self.urdf}: link {visual.link}: mesh filename: {problem}: not drawn")
         self.robot = replace(self.robot, visuals=tuple(each for each in self.robot.visuals if each is not visual))
 
     def values(self, read_rad: Doubles) -> Doubles:
-        """Return values (U,) of `joints` for angles (J,) in the head's order; one that is not finite keeps its last.
+        """Return values (U,) of `joints` for angles (J,) in the head's order.
 
-        A platform keeps its last pose where the angles fit none.
+        An angle that is not finite keeps its last value. A platform keeps its last pose if no pose fits the angles.
         """
         read = np.asarray(read_rad, dtype=np.float64)
         if read.shape != self._read.shape:
@@ -140,7 +140,7 @@ class RobotScene:
 
 
 def urdf_file(head: Head) -> Path | None:
-    """Return the URDF that the head's file names, else the shipped one of that name, else None. Raises ConfigError."""
+    """Return the URDF that the head's file names, else the shipped one of its name, else None. Raises ConfigError."""
     shipped = data_dir("sim") / "heads"
     if head.urdf is None:
         file = shipped / head.name / URDF_FILE
@@ -154,7 +154,7 @@ def urdf_file(head: Head) -> Path | None:
 
 
 def _free(robot: Urdf) -> list[str]:
-    """Return the joints that move and mimic no other."""
+    """Return the joints that move and mimic no other joint."""
     return [joint.name for joint in robot.joints.values() if joint.kind in MOVING and joint.mimic is None]
 
 
@@ -191,8 +191,8 @@ class _NeckPose:
     def values(self, read: Doubles) -> Doubles:
         """Return the values of `joints`. The search for the pose starts at home on the turned body.
 
-        Several poses fit the legs of a platform. After a gap in what is read the last pose may lead to one that the
-        head can only reach by falling through, and from there it would never come back.
+        Several poses fit the legs of a platform. After a gap in the readings, a search from the last pose may find one
+        that the head can reach only by falling through, and later searches would never leave it.
         """
         angles = read[self._columns]
         body = angles[0] if self._neck.turns_body else 0.0
@@ -224,7 +224,7 @@ def rod_angles(platform: StewartPlatform, cranks_rad: Doubles, pose: Doubles) ->
 
 
 def mesh_problem(file: Path, folders: Sequence[Path]) -> str | None:
-    """Return what was expected of a mesh that may not be served or drawn, None for one that may.
+    """Return the requirement that a mesh fails, so that it must not be served or drawn; None for a mesh that may be.
 
     A head's folder is data that people pass on: its URDF must not make other files of this machine public. `file` and
     `folders` are without links (`os.path.realpath`).
@@ -242,7 +242,7 @@ def mesh_problem(file: Path, folders: Sequence[Path]) -> str | None:
 
 
 def _mesh_file(name: str, folder: Path, packages: Mapping[str, Path]) -> Path:
-    """Return the file of a mesh; a package that is not in `packages` is beside `folder`, above it, or beside those."""
+    """Return the file of a mesh; a package not in `packages` is `folder`, a folder above it, or inside one of these."""
     if name.startswith("package://"):
         package, _, inside = name.removeprefix("package://").partition("/")
         above = (folder, *folder.absolute().parents)

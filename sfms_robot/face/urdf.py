@@ -1,8 +1,8 @@
-"""URDF files: links, joints and what is drawn of them; and where every link is for given joint values.
+"""URDF files: links, joints and visuals, and the place of every link for given joint values.
 
-What the format says is at http://wiki.ros.org/urdf/XML. Read: visuals (box, cylinder, sphere, mesh), materials with a
+The format is described at http://wiki.ros.org/urdf/XML. Read: visuals (box, cylinder, sphere, mesh), materials with a
 colour, joints of every type (floating and planar ones stay at their origin), mimic. Not read: inertia, collision,
-transmissions, textures. A visual or a colour that cannot be drawn is left out and named; a link or a joint that cannot
+transmissions, textures. A visual or a colour that cannot be drawn is left out and listed; a link or a joint that cannot
 be read is an error, since places depend on it.
 """
 
@@ -29,7 +29,7 @@ MOVING: Final = (*TURNING, "prismatic")
 _TYPES: Final = (*MOVING, "fixed", "floating", "planar")
 _GREY: Final = (0.7, 0.7, 0.7, 1.0)
 _MOST_NAMED: Final = 3
-_ROUND: Final = {"cylinder": ("radius", "length"), "sphere": ("radius",)}  # their sizes
+_ROUND: Final = {"cylinder": ("radius", "length"), "sphere": ("radius",)}  # names of their sizes
 
 Color = tuple[float, float, float, float]
 
@@ -41,7 +41,7 @@ class Visual:
     Attributes:
         place: (4, 4) shape -> link.
         shape, size: box (x, y, z), cylinder (radius, length along z), sphere (radius,), mesh (scale x, y, z); metres.
-        mesh: its file name as the URDF has it; empty for the others.
+        mesh: its file name as the URDF has it; empty for other shapes.
     """
 
     link: str
@@ -90,7 +90,7 @@ class Urdf:
     Attributes:
         joints: by name, parents before children.
         left_out: one line for each visual or colour that is not drawn, and for angles that look like degrees.
-        text: the file; without what is left out and without a namespace, where it had one of these.
+        text: content of the file, without the elements that are left out and without its namespace, if it had any.
     """
 
     name: str
@@ -101,7 +101,7 @@ class Urdf:
     text: bytes
 
     def link_places(self, values: Mapping[str, float]) -> dict[str, Doubles]:
-        """Return every link's place (4, 4) in the root's axes, for joint values [rad, m]; 0 where none is given."""
+        """Return every link's place (4, 4) in the root's axes, for joint values [rad, m]; a missing value is 0."""
         places = {self.root: np.eye(4)}
         for joint in self.joints.values():
             places[joint.child] = places[joint.parent] @ joint.place @ joint.motion(self._value(joint, values))
@@ -144,7 +144,7 @@ def read_urdf(file: Path, text: bytes | None = None) -> Urdf:
 
 
 def _unresolved(root: Element, spaces: Collection[str]) -> list[str]:
-    """Return what of xacro is left in a file: elements of its namespaces, and attributes with ${...} or $(...)."""
+    """Return the remains of xacro in a file: elements of its namespaces, and attributes with ${...} or $(...)."""
     found = []
     for element in root.iter():
         space, _, name = str(element.tag).removeprefix("{").rpartition("}")
@@ -157,7 +157,7 @@ class _UrdfReader:
     """A reader of one file, whose errors name the file and the element."""
 
     def __init__(self, file: Path, root: Element, text: bytes | None) -> None:
-        """`text`: of these elements; None where they differ from the file's already."""
+        """Read the materials. `text`: text of these elements; None if they differ from the file's already."""
         self._file, self._root, self._text = file, root, text
         self._left_out: list[str] = []
         self._degrees: dict[str, str] = {}  # element with angles beyond a turn -> its angles
@@ -169,7 +169,7 @@ class _UrdfReader:
 
     @contextmanager
     def _left_out_if_wrong(self, parent: Element, element: Element, then: str) -> Iterator[None]:
-        """Name and remove an element that cannot be used."""
+        """List and remove an element that cannot be used."""
         try:
             yield
         except ConfigError as error:
@@ -226,7 +226,7 @@ class _UrdfReader:
         length = float(np.linalg.norm(axis))
         if kind in MOVING and length < 1e-9:
             raise self._wrong("joint", name, "has an axis of length 0")
-        for key in ("lower", "upper"):  # not used here; but whatever reads the file behind us takes them
+        for key in ("lower", "upper"):  # not used here, but by others that read the file
             self._floats(element.find("limit"), key, where, 1, (math.nan,))
         mimic = None
         if (copied := element.find("mimic")) is not None:
@@ -302,7 +302,7 @@ class _UrdfReader:
         return self._colors.get(material.get("name", ""), _GREY) if color is None else self._color(material, color)
 
     def _color(self, material: Element, element: Element) -> Color:
-        if len((text := element.get("rgba", "")).split()) == 3:  # red, green and blue alone are opaque everywhere
+        if len((text := element.get("rgba", "")).split()) == 3:  # only red, green and blue: opaque in all readers
             element.set("rgba", f"{text} 1")
         red, green, blue, opacity = self._floats(element, "rgba", f"material {material.get('name', '')}", 4)
         return red, green, blue, opacity
@@ -319,7 +319,7 @@ class _UrdfReader:
     def _floats(
         self, element: Element | None, key: str, where: str, count: int = 1, default: tuple[float, ...] | None = None
     ) -> tuple[float, ...]:
-        """Return `count` finite numbers of an attribute; `default` where it is missing."""
+        """Return `count` finite numbers of an attribute; `default` if it is missing."""
         text = None if element is None else element.get(key)
         if text is None and default is not None:
             return default

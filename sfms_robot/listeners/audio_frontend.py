@@ -1,6 +1,6 @@
-"""Sound as both listeners take it in: features of the sound and the place in a phrase, frame by frame.
+"""Sound features of both listeners: features of the sound and the place in a phrase, frame by frame.
 
-One path offline and streaming: `rows` and `track` of a whole recording give what the streams give frame by frame.
+Offline and streaming use the same code: `rows` and `track` of a recording return what the streams return per frame.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, NO_SOUND, SILENCE, Bools,
 from sfms_robot.signals import mel, mfcc, phase, voice_activity
 from sfms_robot.signals.audio import energies_db, finite
 
-if TYPE_CHECKING:  # transformers, which only a listener of this kind needs
+if TYPE_CHECKING:  # it imports transformers, which only a listener with wav2vec2 needs
     from sfms_robot.signals.wav2vec2 import Wav2Vec2
 
 Audio = Literal["mel", "mfcc78", "wav2vec2"]
@@ -32,7 +32,7 @@ SHAPES: Final[Mapping[Audio, tuple[int, int]]] = {
 
 @dataclass(frozen=True)
 class AudioState:
-    """Memory of one track: samples that unfinished rows need, and the phrase so far (None: not used)."""
+    """Memory of one track: samples that unfinished rows need, and the phrase so far (None if it is not computed)."""
 
     sound: Floats
     phase: phase.PhaseState | None
@@ -49,8 +49,8 @@ class AudioFrontend:
 
     Attributes:
         audio: the kind of features.
-        phased: whether the place in a phrase (`signals.phase`) is computed as well. Ours.
-        model: computes the features of wav2vec2; without it they have to come with the data.
+        phased: True if the place in a phrase (`signals.phase`) is computed as well. Ours.
+        model: Computes the features of wav2vec2; without it the data must contain them.
     """
 
     audio: Audio = "mel"
@@ -79,7 +79,7 @@ class AudioFrontend:
 
     @property
     def phase_features(self) -> int:
-        """Return how many numbers describe the place in a phrase; 0 without."""
+        """Return the number of features of the place in a phrase; 0 if it is not computed."""
         return phase.FEATURES if self.phased else 0
 
     def start(self) -> AudioState:
@@ -89,10 +89,10 @@ class AudioFrontend:
     def step_each(
         self, sounds: Sequence[Sequence[Floats]], before: Sequence[AudioState]
     ) -> tuple[Floats, Floats, list[AudioState]]:
-        """Return features of several streams, any number of frames each, one stream behind the other.
+        """Return features of several streams, any number of frames each, concatenated stream by stream.
 
         Args:
-            sounds: of each stream its frames, (640,) samples each, or none in a frame, which counts as silence.
+            sounds: frames of each stream, (640,) samples each; a frame without samples counts as silence.
             before: state of each stream.
 
         Returns:
@@ -132,9 +132,9 @@ class AudioFrontend:
 
 # --- Two tracks (ARIG) ------------------------------------------------------------------------------------------------
 #
-# ARIG hears the user and itself. Of each track a frame is 533 numbers: four rows of log-mel (512), what the voice does
-# in these 40 ms, and the place in a phrase (21). Ours: the paper's 768 numbers of wav2vec2 take the place of the mel
-# rows only where the data holds them.
+# ARIG hears the user and itself. A frame of each track has 533 numbers: four rows of log-mel (512), which describe the
+# voice in these 40 ms, and the place in a phrase (21). Ours: the paper's 768 numbers of wav2vec2 replace the mel rows
+# only where the data contains them.
 
 TRACKS: Final = AudioFrontend("mel", phased=True)
 MEL_WIDTH: Final = mel.ROWS_PER_FRAME * mel.MEL_BINS
@@ -146,8 +146,8 @@ def hear_each(
 ) -> tuple[Floats, list[bool], list[AudioState]]:
     """Return features (N, 533) of one frame of N tracks, which of them have sound, and the next states.
 
-    `samples`: (640,) of each, or None or empty where there is no sound, which counts as silence. Samples that are not
-    finite are silence too. Raises ValueError for another length.
+    `samples`: (640,) of each track, or None or empty where there is no sound, which counts as silence. Samples that are
+    not finite count as silence too. Raises ValueError for another length.
     """
     clean = [SILENCE if each is None or not len(each) else finite(each)[0] for each in samples]
     for each in clean:
@@ -170,9 +170,9 @@ def of_mel(rows: Floats) -> tuple[Floats, Bools]:
 
 
 def fit_frame(samples: Floats | None) -> Floats | None:
-    """Return samples of the agent's track cut or padded with silence to one frame, or None where there are none.
+    """Return samples of the agent's track cut or padded with silence to one frame, or None if there are none.
 
-    Its clock is not the microphone's: at 200 ppm a frame has a sample too many or too few every 8 s.
+    The track's clock is not the microphone's: at 200 ppm, one frame in 8 has a sample too many or too few.
     """
     if samples is None or not len(samples):
         return None

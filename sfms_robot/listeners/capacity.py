@@ -1,13 +1,13 @@
-"""Number of heads that one server can answer in time, from what steps cost on this machine.
+"""Number of heads that one server can answer in time, from the measured cost of steps on this machine.
 
-While a batch is made frames wait, and are the next batch. n heads send n / T frames a second, of which every `hop`-th
-needs a plan, so batches settle at a duration B in which just as many frames come as a batch of that duration takes:
+Frames that arrive while a batch is computed form the next batch. n heads send n / T frames a second, and every `hop`-th
+of them needs a plan. So batches settle at a duration B in which as many frames arrive as a batch of that duration has:
 
     cost(n B / T) = B,   cost(m) = plan(m / hop) + other(m - m / hop)
 
-A frame that comes just too late for one batch waits for it and for the next: 2 B, a little more where the machine is
-uneven. That is compared with the deadline. Costs are measured at the start for some sizes of batches, lines are drawn
-between them, and while serving they are scaled by how long batches really take.
+A frame that comes just too late for one batch waits for that batch and for the next: 2 B, and a little more where
+durations vary. This delay is compared with the deadline. Costs are measured at the start for some batch sizes and
+interpolated linearly between them. While serving they are scaled by the real durations of batches.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from sfms_robot.frames import FRAME_S, SILENCE, Plan, SpeakerFrame
 from sfms_robot.ports import Listener
 
 SIZES: Final = (1, 2, 4, 8, 16, 32)
-GPU_SIZES: Final = (*SIZES, 64, 128, 256)  # of batches on a GPU, whose graphs are made by this
-ROUNDS: Final = 3  # plans that are measured at each size, after one that is not
-UNEVEN: Final = 1.2  # of 2 B: what the slowest of a hundred takes, measured
-_STEPS: Final = 1 << 20  # of the search for B
+GPU_SIZES: Final = (*SIZES, 64, 128, 256)  # batch sizes on a GPU; measuring them also captures their graphs
+ROUNDS: Final = 3  # measured plans at each size, after one that is not measured
+UNEVEN: Final = 1.2  # measured delay of the slowest frame in a hundred, relative to 2 B
+_STEPS: Final = 1 << 20  # resolution of the search for B
 
 
 # --- Batches ----------------------------------------------------------------------------------------------------------
@@ -37,9 +37,9 @@ _STEPS: Final = 1 << 20  # of the search for B
 def step_each(
     listener: Listener, speakers: Sequence[SpeakerFrame], memories: Sequence[Any], *controls: Sequence[Any]
 ) -> list[tuple[Plan | None, Any]]:
-    """Step each stream once; in one batch where the listener can (`engine.RunsOnEngine`).
+    """Step each stream once, in one batch if the listener supports it (`engine.RunsOnEngine`).
 
-    `controls`: one sequence of them, for a listener that takes control.
+    `controls`: one sequence of control rows, for a listener that accepts control.
     """
     together = getattr(listener, "step_each", None)
     if together is None:
@@ -54,9 +54,9 @@ class Capacity:
 
     Attributes:
         hop: frames from one plan to the next.
-        sizes: heads in a batch, rising.
-        plan_s, other_s: duration of a batch in which all plan, or none.
-        scale: by how much longer batches take in service.
+        sizes: measured numbers of heads in a batch, in ascending order.
+        plan_s, other_s: duration of a batch of each size in which all heads plan, or none of them.
+        scale: duration of batches in service relative to the measured one.
     """
 
     hop: int
@@ -66,11 +66,11 @@ class Capacity:
     scale: float = 1.0
 
     def batch_s(self, plans: float, others: float) -> float:
-        """Return the duration of a batch of so many steps with and without a plan."""
+        """Return the duration of a batch of `plans` steps with a plan and `others` without."""
         return self.scale * (_between(self.sizes, self.plan_s, plans) + _between(self.sizes, self.other_s, others))
 
     def delay_s(self, heads: int, deadline_s: float) -> float:
-        """Return the longest time from a frame to its plan; inf where `heads` are more than it can keep up with."""
+        """Return the longest time from a frame to its plan; inf if the machine cannot keep up with so many heads."""
         if not heads:
             return 0.0
         longest_s = 2 * deadline_s
@@ -84,7 +84,7 @@ class Capacity:
         return 2 * step / _STEPS * longest_s * UNEVEN if step <= _STEPS else math.inf
 
     def most(self, deadline_s: float) -> int:
-        """Return the number of heads that are answered within the deadline."""
+        """Return the largest number of heads that are answered within the deadline."""
         return bisect_left(range(1, 10_001), True, key=lambda heads: self.delay_s(heads, deadline_s) > deadline_s)
 
 
@@ -111,7 +111,7 @@ def measure_capacity(
 
 
 def _between(sizes: Sequence[int], costs_s: Sequence[float], count: float) -> float:
-    """Return the cost of `count`: 0 for none, a line between two sizes, and the last line beyond."""
-    at, cost_s = (0, *sizes), (0.0, *costs_s)  # some batches have one, most have none
+    """Return the cost of `count` steps: linear between 0 (no cost) and the sizes, extrapolated beyond the last one."""
+    at, cost_s = (0, *sizes), (0.0, *costs_s)  # a count below 1: some batches have one such step, most have none
     slope = max(0.0, (cost_s[-1] - cost_s[-2]) / (at[-1] - at[-2]))
     return float(np.interp(count, at, cost_s)) + slope * max(0.0, count - at[-1])

@@ -1,4 +1,4 @@
-"""A listener's folder: config.yaml and model.safetensors. Every fault of them is one ModelError."""
+"""A listener's folder: config.yaml and model.safetensors. Faults in them raise ConfigError or ModelError."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
     from torch import nn
 
 Array = NDArray[Any]
-Shapes = Mapping[str, tuple[tuple[int, ...], bool]]  # of tensors by name; True where they hold real numbers
+Shapes = Mapping[str, tuple[tuple[int, ...], bool]]  # shape of each tensor by name; True if it holds real numbers
 Bits = Literal[8, 16, 32]
 CONFIG = "config.yaml"
 WEIGHTS = "model.safetensors"
 BFLOAT16, INT8 = "BF16", "I8"
 PIECE_BYTES = 16 * 2**20
-ROW_SCALE: Final = ".row_scale"  # added to the name of a matrix in 8 bits
+ROW_SCALE: Final = ".row_scale"  # suffix to the name of a matrix in 8 bits: the tensor of its factors
 LARGE: Final = 4096  # numbers; a smaller matrix is not worth 8 bits
-LARGEST = 1e6  # of any value: an unmeasured speed is stored as this, weights are below 200, and 1e30 overflows
+LARGEST = 1e6  # limit of every value: an unmeasured speed is stored as 1e6, weights are below 200, and 1e30 overflows
 
 
 def load_config(folder: Path) -> config.ListenerSettings:
@@ -37,7 +37,7 @@ def load_config(folder: Path) -> config.ListenerSettings:
 
 
 def save_config(folder: Path, settings: config.ListenerSettings) -> None:
-    """Write `folder`/config.yaml. Raises ModelError where it cannot be written."""
+    """Write `folder`/config.yaml. Raises ModelError if it cannot be written."""
     text = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, width=110, default_flow_style=None)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -52,19 +52,19 @@ def save_weights(file: Path, module: nn.Module, bits: Bits = 32) -> None:
 
 
 def write_tensors(file: Path, tensors: Mapping[str, Array], bits: Bits = 32) -> None:
-    """Write tensors and replace `file` in one move, so that an interrupted run leaves the old file.
+    """Write tensors and replace `file` in one step, so that an interrupted run leaves the old file.
 
-    `bits`: 16 halves the size. 8 quarters it for matrices of `LARGE` numbers and more, which become integers of -127 to
-    127 and one factor per row (NAME.row_scale), so that no number is off by more than 1/254 of the largest of its row;
-    everything else is stored in 16 bits where that loses nothing. Loading always gives 32 bits.
+    `bits`: 16 halves the size. 8 quarters the size of matrices with `LARGE` numbers or more: they become integers from
+    -127 to 127 with one factor per row (NAME.row_scale), and no number is off by more than 1/254 of the largest in its
+    row. All other tensors are then stored in 16 bits where that loses nothing. Loading always returns 32 bits.
 
-    Raises ModelError where the file cannot be written; no part of it stays.
+    Raises ModelError if the file cannot be written; no part of it stays.
     """
     part = file.with_suffix(".part")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         save_file({name: np.asarray(value, order="C") for name, value in _packed(tensors, bits)}, part)
-        part.chmod(0o644)  # safetensors leaves it readable by its owner alone
+        part.chmod(0o644)  # safetensors creates files that only their owner can read
         part.replace(file)
     except (OSError, SafetensorError) as error:
         if part.is_file():
@@ -89,7 +89,7 @@ def _packed(tensors: Mapping[str, Array], bits: Bits) -> Iterator[tuple[str, Arr
 
 
 def load_weights(file: Path, module: nn.Module) -> None:
-    """Fill `module` from a safetensors file. Runs no code of the file; raises ModelError as `stored_tensors`."""
+    """Fill `module` from a safetensors file. Runs no code of the file. Raises ModelError as `stored_tensors`."""
     import torch
 
     wanted = {name: (tuple(value.shape), value.is_floating_point()) for name, value in module.state_dict().items()}
@@ -104,11 +104,11 @@ def read_weights(file: Path) -> dict[str, Array]:
 def stored_tensors(file: Path, wanted: Shapes | None = None) -> Iterator[tuple[str, Array]]:
     """Yield names and tensors of a safetensors file, real numbers in 32 bits. Runs no code of the file.
 
-    They come one after another: a caller that keeps none needs little more memory than the largest takes. `wanted`:
-    the tensors that must be there, and no others; None accepts any.
+    Tensors are read one after another: a caller that keeps none needs little more memory than the largest one.
+    `wanted`: tensors that the file must contain, and no others; None accepts any.
 
-    Raises ModelError when the file or a tensor is missing, cut off, of another shape or type, not finite, or of values
-    that no trained model has; for wrong names, before the first tensor.
+    Raises ModelError if the file or a tensor is missing, cut off, of another shape or type, not finite, or has values
+    that no trained model has. For wrong names it is raised before the first tensor is read.
     """
     if not file.is_file():
         raise ModelError(f"{file}: no such weights file")
@@ -131,7 +131,7 @@ def stored_tensors(file: Path, wanted: Shapes | None = None) -> Iterator[tuple[s
 
 
 def _check(tensor: str, value: Array, wanted: tuple[tuple[int, ...], bool] | None) -> None:
-    """Raise ModelError, beginning with `tensor`, for a wrong shape or type and for impossible values."""
+    """Raise ModelError for a wrong shape or type and for impossible values; its text begins with `tensor`."""
     shape, real = wanted or (value.shape, value.dtype.kind == "f")
     if value.shape != shape:
         raise ModelError(f"{tensor} has shape {value.shape}, the configuration needs {shape}")
@@ -139,7 +139,7 @@ def _check(tensor: str, value: Array, wanted: tuple[tuple[int, ...], bool] | Non
         raise ModelError(f"{tensor} is of {value.dtype}, the model needs {'float32' if real else 'int64'}")
     if not real or not value.size:
         return
-    largest = float(max(value.max(), -value.min()))  # NaN if any value is
+    largest = float(max(value.max(), -value.min()))  # NaN if any value is NaN
     if not math.isfinite(largest):
         raise ModelError(f"{tensor} holds values that are not finite")
     if largest > LARGEST:
@@ -147,7 +147,10 @@ def _check(tensor: str, value: Array, wanted: tuple[tuple[int, ...], bool] | Non
 
 
 def _read(file: Path, kinds: Mapping[str, str], scales: Set[str]) -> Iterator[tuple[str, Array]]:
-    """Yield tensors as stored. The file is opened again every `PIECE_BYTES`: while it is mapped, read pages stay."""
+    """Yield tensors, those in 8 bits multiplied by their factors.
+
+    The file is reopened every `PIECE_BYTES`, because pages that were read stay in memory while it is mapped.
+    """
     names = [name for name, kind in kinds.items() if kind != BFLOAT16 and name not in scales]
     while names:
         with safe_open(file, "np") as stored:
@@ -158,7 +161,7 @@ def _read(file: Path, kinds: Mapping[str, str], scales: Set[str]) -> Iterator[tu
                 if name + ROW_SCALE in scales:
                     value = _scaled(f"{file}: tensor {name}", value, stored.get_tensor(name + ROW_SCALE))
                 yield name, value
-    if BFLOAT16 in kinds.values():  # numpy has no such type: it is the upper half of a 32-bit number
+    if BFLOAT16 in kinds.values():  # numpy lacks this type: such a number is the upper half of a 32-bit number
         for name, raw in deserialize(file.read_bytes()):  # type: ignore[no-untyped-call]
             if raw["dtype"] == BFLOAT16:
                 upper = np.frombuffer(raw["data"], np.uint16).astype(np.uint32) << 16
@@ -169,6 +172,6 @@ def _scaled(tensor: str, value: Array, scale: Array) -> Array:
     """Return a matrix in 8 bits as real numbers."""
     if scale.shape != value.shape[:1] or scale.dtype.kind != "f":
         raise ModelError(f"{tensor}{ROW_SCALE} is not {value.shape[:1]} real numbers, one per row")
-    with np.errstate(over="ignore", invalid="ignore"):  # `_check` reports what is not finite
+    with np.errstate(over="ignore", invalid="ignore"):  # `_check` reports values that are not finite
         scaled: Array = value * scale.astype(np.float32).reshape(-1, *[1] * (value.ndim - 1))
     return scaled

@@ -1,9 +1,9 @@
-"""Engines, which compute a listener's networks: the seam between a stream (numpy) and the library that multiplies.
+"""Engines, which compute a listener's networks: the interface between a stream (numpy) and onnxruntime or torch.
 
 A stream calls networks by name: arrays in, arrays out, no state kept. There are two engines. `OnnxEngine` runs graphs
-in onnxruntime without torch: a tenth of torch's start-up time, and small models in half its time. `TorchEngine`
-(`torch_engine`) runs the modules, for listeners without graphs and for the lab; its `BatchEngine` many streams at once
-on a GPU.
+in onnxruntime without torch: it starts in a tenth of torch's time and runs small models in half its time. `TorchEngine`
+(`torch_engine`) runs the modules, for listeners without graphs and for the lab; its subclass `BatchEngine` runs many
+streams at once on a GPU.
 
 A listener's folder holds its graphs as onnx/NAME.onnx, without weights, and onnx/graphs.json, which lists the weights
 that each graph needs and the configuration that they belong to. So a graph that is cut short, belongs to another model
@@ -37,8 +37,8 @@ from sfms_robot.listeners.checkpoint import WEIGHTS, Array, Shapes, stored_tenso
 EngineName = Literal["auto", "torch", "onnx"]
 Device = Literal["cpu", "cuda"]
 
-KEPT: Final = 4096  # numbers of a tensor that streams may read: scales, not weights
-ROWS: Final = 64  # of a weight rounded at a time: what fits the cache takes half as long
+KEPT: Final = 4096  # numbers of the largest tensor that streams may read: scales, not weights
+ROWS: Final = 64  # rows of a weight that are rounded at a time: rows that fit the cache take half as long
 FULL, HALF = 127, 64  # older x86 processors add pairs of products in 16 bits, where full-range integers overflow
 
 log = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ class Engine(Protocol):
     """The networks of one listener.
 
     Attributes:
-        name: "torch" or "onnx", and how it computes: "onnx int8, 2 threads".
+        name: "torch" or "onnx" with precision, threads or device, such as "onnx int8, 2 threads".
         tensors: tensors of model.safetensors by name that are not weights of a network: scales of motion and sound,
             distributions that streams draw from. Read-only.
     """
@@ -62,7 +62,7 @@ class Engine(Protocol):
     def run(self, network: str, *inputs: Array) -> tuple[Array, ...]:
         """Return the outputs of a network, each (N, ...), for N streams.
 
-        `inputs` are (N, ...) in the network's order; one of (1, ...) is the same for all streams.
+        `inputs` are (N, ...) in the network's order; an input (1, ...) is the same for all streams.
         """
         ...
 
@@ -71,13 +71,13 @@ class Engine(Protocol):
 
 
 class RunsOnEngine:
-    """A listener whose networks an engine runs. It has no state but the weights, held by the engine.
+    """A listener whose networks an engine runs. Its only state is the weights, which the engine holds.
 
     Attributes:
-        hop: frames from one plan to the next; hops: those that `at_hop` takes.
+        hop: frames from one plan to the next; hops: values that `at_hop` accepts.
         horizon: frames of a plan.
-        control_frames: rows of control that a step takes, up to the newest frame and after it; (0, 0) without events.
-        control_columns: numbers of such a row; 0 without events.
+        control_frames: numbers of control rows of a step, up to the newest frame and after it; (0, 0) without events.
+        control_columns: numbers in such a row; 0 without events.
     """
 
     engine: Engine
@@ -88,7 +88,7 @@ class RunsOnEngine:
     control_columns = 0
 
     def at_hop(self, hop: int) -> Self:
-        """Return a listener of the same weights that plans every `hop` frames, one of `hops`."""
+        """Return a listener with the same weights that plans every `hop` frames; `hop` is one of `hops`."""
         other = copy.copy(self)
         other.hop = hop
         return other
@@ -102,12 +102,12 @@ class RunsOnEngine:
         raise NotImplementedError
 
     def step(self, speaker: SpeakerFrame, memory: Any, control: Floats | None = None) -> tuple[Plan | None, Any]:
-        """Take one frame; return a Plan where one is due, and the next memory. Never changes `memory` in place.
+        """Process one frame; return a Plan if one is due, and the next memory. Never changes `memory` in place.
 
-        `control`: rows of `signals.control`, as many as `control_frames` says up to this frame and after it; None
+        `control`: rows of `signals.control`, as many as in `control_frames` up to this frame and after it; None
         without events, and for a frame that brings no plan.
 
-        Raises ValueError when the frame holds another number of samples than 640 or none, or control another shape.
+        Raises ValueError unless the frame has 640 samples or none and control has the right shape.
         """
         return self.step_each([speaker], [memory], [control])[0]
 
@@ -116,14 +116,14 @@ class RunsOnEngine:
     ) -> list[tuple[Plan | None, Any]]:
         """Run `step` of N streams of different people, one frame and one memory each, in a fraction of the time.
 
-        Every stream gives the same results as alone, in fp32 but for the last digits (sums are added in another order):
-        its plan is its own, and None where it is not due. Never changes memories in place. Raises as `step`, for the
-        first frame that is refused; then no stream has moved.
+        Every stream has the same results as alone, in fp32 except for the last digits (sums are added in another
+        order): its own plan, or None if none is due. Never changes memories in place. Raises as `step` for the first
+        frame that is refused; then no stream has advanced.
         """
         raise NotImplementedError
 
     def told(self, controls: Sequence[Floats | None]) -> Floats:
-        """Return controls as of `step` of N streams (N, P + A, K), None being no event; (N, 0, 0) without events.
+        """Stack the `control` of `step` of N streams to (N, P + A, K), 0 for None; (N, 0, 0) without events.
 
         Raises ValueError for another shape.
         """
@@ -149,7 +149,7 @@ class RunsOnEngine:
 
 
 def stacked(parts: Sequence[Array]) -> Array:
-    """Return (N, ...) of N arrays (...), read-only: a single one is not copied."""
+    """Stack N arrays (...) to (N, ...), read-only: a single array is not copied."""
     return parts[0][None] if len(parts) == 1 else np.stack(parts)
 
 
@@ -158,13 +158,13 @@ def stacked(parts: Sequence[Array]) -> Array:
 FOLDER: Final = "onnx"
 MANIFEST: Final = "graphs.json"
 FORMAT: Final = 1
-# Settings that graphs do not depend on: use of the networks' outputs, and training.
+# Settings that graphs do not depend on: they are for the use of the networks' outputs, and for training.
 OUTSIDE: Final = frozenset(
     "description hop sampling precision neutral metres_per_unit flame_matrix wav2vec2 scores placement "
     "max_gap_frames".split()
 )
 OUTSIDE_GROUPS: Final = ("keyframes", "keyframe_cost", "transition_bias")
-# Keys that came after graphs had been exported: their defaults are what those graphs do.
+# Keys that were added after graphs had been exported: their defaults describe those graphs.
 LATER: Final[Mapping[str, object]] = {"squashed": False, "schedule": "cosine"}
 
 
@@ -174,8 +174,8 @@ class Graph(BaseModel):
     Attributes:
         sha256: hash of its ONNX file.
         weights: tensors of model.safetensors that it needs, by name.
-        integers: those of them that it needs in 8 bits (`integers`).
-        data: its ONNX file, once that was read.
+        integers: weights among them that it needs in 8 bits (see the function `integers`).
+        data: content of its ONNX file, once that was read.
     """
 
     sha256: str
@@ -185,12 +185,12 @@ class Graph(BaseModel):
 
 
 class GraphFolder(BaseModel):
-    """The graphs of a listener, as their list has them.
+    """The graphs of a listener, as listed in graphs.json.
 
     Attributes:
-        settings: of which settings they are (`digest`).
-        networks: by name.
-        tensors: what `checkpoint.stored_tensors` has to find in model.safetensors.
+        settings: hash of the settings that they belong to (`digest`).
+        networks: graphs by name.
+        tensors: tensors that model.safetensors must contain (`checkpoint.stored_tensors`).
     """
 
     format: int
@@ -223,9 +223,9 @@ def has_graphs(folder: Path) -> bool:
 
 
 def read_graphs(folder: Path, settings: config.ListenerSettings, integers: bool = False) -> GraphFolder:
-    """Read the graphs of a listener's folder; with `integers` each network that has a graph in 8 bits uses that.
+    """Read the graphs of a listener's folder; with `integers` each network that has a graph in 8 bits uses that graph.
 
-    Raises ModelError when a file is missing, cut short, changed, or of another configuration.
+    Raises ModelError if a file is missing, cut short, changed, or of another configuration.
     """
     file, remedy = folder / FOLDER / MANIFEST, f"export them again: sfms-robot export {folder}"
     try:
@@ -255,31 +255,31 @@ def read_graphs(folder: Path, settings: config.ListenerSettings, integers: bool 
 # --- onnxruntime ------------------------------------------------------------------------------------------------------
 #
 # A session is made of a graph without weights and of the weights of model.safetensors. Large layers may be in 8-bit
-# integers: for one stream a layer costs what it takes to read its weights, and in bytes that is a quarter. Weights are
-# rounded per output row when they are loaded, the input by its own range.
+# integers: for one stream, the cost of a layer is the time to read its weights, and bytes take a quarter of it. Weights
+# are rounded per output row when they are loaded, inputs by their range at each call.
 
 
 class OnnxEngine:
     """An `Engine` on onnxruntime.
 
     Args:
-        folder: of the listener; its weights are read again whenever the number of threads changes.
-        graphs: of its networks.
-        threads: that each network may use.
+        folder: folder of the listener; its weights are read again whenever the number of threads changes.
+        graphs: graphs of its networks.
+        threads: number of threads that each network may use.
 
-    Raises ModelError as `checkpoint.stored_tensors`, and for a graph that onnxruntime does not take.
+    Raises ModelError as `checkpoint.stored_tensors`, and for a graph that onnxruntime does not accept.
     """
 
     def __init__(self, folder: Path, graphs: GraphFolder, threads: int = 1) -> None:
         self._folder, self._graphs = folder, graphs
         self.tensors: Mapping[str, Array] = {}
         self._threads = 0
-        self._sessions: dict[str, tuple[Any, list[str]]] = {}  # of each network, with the names of its inputs
+        self._sessions: dict[str, tuple[Any, list[str]]] = {}  # session of each network, and the names of its inputs
         self.set_threads(threads)
 
     @property
     def name(self) -> str:
-        """Return "onnx", the precision and the threads."""
+        """Return "onnx", the precision and the number of threads."""
         precision = " int8" if self._graphs.in_integers else ""
         return f"onnx{precision}, {self._threads} thread{'s' * (self._threads > 1)}"
 
@@ -318,7 +318,7 @@ class OnnxEngine:
 
 
 def _trim() -> None:
-    """Return memory that loading has freed to the system: with large layers half of all, on a C library that can."""
+    """Return memory freed after loading to the system, if the C library can; with large layers that is half of all."""
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
@@ -330,23 +330,23 @@ def _value(array: Array) -> Any:
 
 
 def _session(failure: str, graph: Graph, values: Mapping[str, Any], threads: int) -> Any:
-    """Return a session of a graph. Raises ModelError, which begins with `failure`."""
+    """Return a session of a graph. Raises ModelError, whose text begins with `failure`."""
     onnxruntime = _onnxruntime()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # the servo loop has the other core
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # the servo loop uses the other core
     options.log_severity_level = 3
     names = [name for name in graph.weights if name not in graph.integers]
     names += [f"{name}.{part}" for name in graph.integers for part in ("int8", "scale")]
     options.add_external_initializers(names, [values[name] for name in names])
     try:
         return onnxruntime.InferenceSession(graph.data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime has no class of its own for faults of a file
+    except Exception as error:  # onnxruntime has no exception class for faults of a file
         raise ModelError(f"{failure}: {first_line(error)}") from error
 
 
 def _onnxruntime() -> Any:
-    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # it looks up its maker's host
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # otherwise it looks up a host of its maker
     import onnxruntime
 
     return onnxruntime
@@ -378,13 +378,13 @@ def whole_integers() -> bool:
 
 # --- Choice of an engine ----------------------------------------------------------------------------------------------
 #
-# `auto` is onnx where the folder has graphs that fit, torch elsewhere. The loading process (`process`) measures whether
-# one thread or all free cores are faster. Nothing imports torch only to find that it is slower: that costs two seconds
-# and 200 MB.
+# `auto` is onnx if the folder has graphs that fit, else torch. The loading process (`process`) measures whether one
+# thread or all free cores are faster. torch is never imported only to measure that it is slower: that would cost two
+# seconds and 200 MB.
 
 
 def graphs_to_run(folder: Path, settings: config.ListenerSettings, wanted: EngineName) -> GraphFolder | None:
-    """Return the graphs to run; None for torch. `precision: auto` takes 8 bits where there are graphs of it.
+    """Return the graphs to run; None for torch. `precision: auto` selects graphs in 8 bits where there are any.
 
     Raises ModelError.
     """

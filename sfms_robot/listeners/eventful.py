@@ -1,30 +1,33 @@
-"""A listener in four parts: events say when, a model of motion says how, kinematics move the eyes, a face never rests.
+"""A listener of four parts: an event model, a model of motion, kinematics of the eyes, and idle motion of the face.
 
 For each frame, in this order:
 
-    events      hazards judge the person and what was done before, and decide (`events.model`)
-    control     what has been decided becomes rows of numbers, of the past and of the frames to be planned
-    motion      the model draws head and face from those rows; the direction of the eyes it leaves alone
+    events      hazards depend on the person and on own earlier events, and decide new ones (`events.model`)
+    control     decided events become rows of numbers, for past frames and for the frames to be planned
+    motion      the model draws head and face from those rows, but not the direction of the eyes
     gaze        the eyes go to the target of the last gaze shift, the head follows, and while it nods the eyes stay
-    idle        the small motion of a resting face, where the listener has learned any (`idle`)
+    idle        the small motion of a resting face, if the listener has learned one (`idle`)
 
-Frame t ends at (t + 1) T. When it has been heard, with P past and A ahead of `RunsOnEngine.control_frames`, horizon H:
+Frame t ends at (t + 1) T. The table is for the time after frame t has come. P and A are the numbers of past and future
+rows in `RunsOnEngine.control_frames`, H is the horizon:
 
     frame             t-P+1 .. t-1   t | t+1  t+2  t+3  t+4 .. t+H
     control rows          0 .. P-2 P-1 |   P  P+1  P+2  ..   P+A-1
     plan frames                        |   0    1    2    3 ..  H-1      times_s[0] = (t + 2) T
     memory.gaze                      0 |   1    2    3    4 ..   H       state of the eyes after that frame
-    events decided                   d | begin behind frame t+3 = t + LEAD_FRAMES, at (t + 4) T
+    events decided                   d | begin after frame t+3 = t + LEAD_FRAMES, at (t + 4) T
 
-Hazards are drawn for every frame; only every `hop`-th brings a plan. A plan brings the events decided since the one
-before it, which begin no sooner than the plan does, for any hop up to LEAD_FRAMES + 1, and are never taken back. When h
-frames of the plan in force have passed, the eyes are at its h-th state: `memory.gaze` loses its first entry per frame.
+Hazards are drawn for every second frame (`events.model.STEP_FRAMES`); only every `hop`-th frame brings a plan. A plan
+contains the events decided since the previous plan. For any hop up to LEAD_FRAMES + 1 they begin no sooner than the
+plan does, and they are never revoked. When h frames of the plan in force have passed, the eyes are at its h-th state:
+`memory.gaze` loses its first entry per frame.
 
-The model of motion learned from people who sat before a camera. A face further from that than a camera follows (upside
-down, far off) is not passed to it; events judge it against its own last second (`events.evidence`).
+The model of motion was trained on people in front of a camera. A face that is turned or moved further than a camera
+follows (upside down, far off) is not passed to it; events compare that face with its own last second
+(`events.evidence`).
 
-Laws: `step_each` of several streams is each one's `step`; a plan brings each event once; with nothing decided the eyes
-look at the person; memory holds what is still under way, no more.
+Laws: `step_each` of several streams equals `step` of each. Every event is in one plan only. Without decided events the
+eyes look at the person. Memory holds only what is still in progress.
 """
 
 from __future__ import annotations
@@ -56,9 +59,9 @@ class EventfulMemory:
 
     Attributes:
         when, how: memories of the event model and of the motion model.
-        news: decided since the last plan.
+        news: events decided since the last plan.
         gaze: state of the eyes after the newest frame, then after every further frame of the plan in force.
-        idle: the stream's own idle motion; None: it has none.
+        idle: idle motion of the stream; None if the listener has none.
     """
 
     when: EventMemory
@@ -69,7 +72,7 @@ class EventfulMemory:
 
 
 class EventfulListener(RunsOnEngine):
-    """A listener of parts: `when` decides, `how` moves, `idle` moves a face at rest. Takes no control."""
+    """A listener of parts: `when` decides events, `how` draws motion, `idle` moves a face at rest. Ignores control."""
 
     def __init__(
         self, how: RunsOnEngine, when: EventModel, calmness: Calmness | None, idle: IdleMotion | None = None
@@ -78,7 +81,7 @@ class EventfulListener(RunsOnEngine):
         self.engine, self.hop, self.hops, self.horizon = how.engine, how.hop, how.hops, how.horizon
 
     def at_hop(self, hop: int) -> Self:
-        """Return the same listener, planning every `hop` frames."""
+        """Return the same listener with a plan every `hop` frames."""
         other = super().at_hop(hop)
         other.how = self.how.at_hop(hop)
         return other
@@ -99,15 +102,15 @@ class EventfulListener(RunsOnEngine):
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventfulMemory], controls: object = None
     ) -> list[tuple[Plan | None, EventfulMemory]]:
-        """Step several streams, as `engine.RunsOnEngine`."""
+        """Step several streams, see `engine.RunsOnEngine.step_each`."""
         past, ahead = self.how.control_frames
         decided = self.when.step_each(speakers, [memory.when for memory in memories])
         found: list[EventfulMemory] = []
         rows: list[Floats | None] = []
         for speaker, memory, (events, when) in zip(speakers, memories, decided, strict=True):
-            gaze = memory.gaze[1:] or memory.gaze  # past the end of a plan the eyes stay
+            gaze = memory.gaze[1:] or memory.gaze  # after the end of a plan the eyes stay
             found.append(changed(memory, when=when, news=memory.news + events, gaze=gaze))
-            # Control rows of frames t - P + 1 to t + A, where frame t brings a plan.
+            # Control rows of frames t - P + 1 to t + A, if frame t brings a plan.
             due, first = self.how.is_due(memory.how), speaker.number + 1 - past
             rows.append(control_track(when.done, first, past + ahead) if due else None)
         moved = self.how.step_each([*map(_believed, speakers)], [memory.how for memory in found], rows)
@@ -131,7 +134,7 @@ class EventfulListener(RunsOnEngine):
 
 
 def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
-    """Return the frame without its face where that is turned or moved further than a person before a camera is."""
+    """Return the frame, without its face if that is turned or moved further than a person in front of a camera."""
     if speaker.face is None:
         return speaker
     pose = [abs(value) for value in speaker.face.pose.tolist()]
@@ -140,7 +143,7 @@ def _believed(speaker: SpeakerFrame) -> SpeakerFrame:
 
 
 def target_at(events: Sequence[ListenerEvent], time_s: float) -> tuple[float, float]:
-    """Return (yaw, pitch) [rad] of the last gaze shift that has begun by `time_s`; at the person before the first."""
+    """Return (yaw, pitch) [rad] of the last gaze shift that has begun by `time_s`; `AT_PERSON` before the first."""
     for event in reversed(events):
         if event.target_rad is not None and event.start_s <= time_s + 1e-9:
             return event.target_rad

@@ -1,6 +1,6 @@
-"""Layers that both listeners share: attention, feed-forward, modulation, written out so that a step is plain to see.
+"""Layers that both listeners share: attention, feed-forward, modulation, written out so that each step is visible.
 
-SFMS is made of `Block`s over sequences. ARIG makes one frame at a time: a query looks at a few tokens
+SFMS consists of `Block`s over sequences. ARIG computes one frame at a time: a query attends to a few tokens
 (`CrossAttention`).
 
 Shapes: B batch, T frames of the query, S frames of the memory, N samples, D width, h heads.
@@ -40,7 +40,7 @@ def places_of(x: Tensor) -> Tensor:
     return sinusoidal(x.shape[1], x.shape[2], x.device).to(x)
 
 
-# --- What both models are made of -------------------------------------------------------------------------------------
+# --- Parts of both models ---------------------------------------------------------------------------------------------
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -49,7 +49,7 @@ def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 
 class ListenerModel(nn.Module):
-    """Weights of one listener. Base of both: scales of motion and sound, and the sway, which training sets."""
+    """Base class of both listeners' weights: scales of motion and sound, and the sway, all set by training."""
 
     def __init__(self, settings: config.ListenerSettings, sound_width: int) -> None:
         super().__init__()
@@ -64,7 +64,7 @@ class ListenerModel(nn.Module):
             self.sway_spread = nn.Buffer(torch.zeros(()))
 
     def standardise(self, motion: Tensor) -> Tensor:
-        """Return motion (..., C) of the model's motion space in the units it works in."""
+        """Return motion (..., C) of the model's motion space in the units of the model."""
         return (motion - self.motion_mean) / self.motion_std
 
     def restore(self, motion: Tensor) -> Tensor:
@@ -72,7 +72,7 @@ class ListenerModel(nn.Module):
         return motion * self.motion_std + self.motion_mean
 
     def standardise_sound(self, sound: Tensor) -> Tensor:
-        """Return sound features (..., A) in the units the model works in."""
+        """Return sound features (..., A) in the units of the model."""
         return (sound - self.sound_mean) / self.sound_std
 
 
@@ -80,11 +80,11 @@ Model = TypeVar("Model", bound=ListenerModel)
 
 
 class Network(nn.Module, Generic[Model]):
-    """A function of tensors of one model, whose weights keep their names in model.safetensors, behind "model.".
+    """A function of tensors of one model. Its weights are named as in model.safetensors, with the prefix "model.".
 
     Attributes:
-        free: inputs of (B, K, ...), K any number but the same for all of them.
-        further: names of the inputs that `forward` takes as its last one, `*parts`.
+        free: names of the inputs (B, K, ...), where K is any number, the same for all of them.
+        further: names of the inputs that `forward` accepts as its last argument, `*parts`.
     """
 
     free: Sequence[str] = ()
@@ -97,8 +97,8 @@ class Network(nn.Module, Generic[Model]):
 
 # --- Operators of onnxruntime -----------------------------------------------------------------------------------------
 #
-# While a graph is exported, attention and LayerNorm become the one operator that onnxruntime has for each. The dozen
-# operators that torch would write in its place cost more than the few frames they compute.
+# While a graph is exported, attention and LayerNorm become the one operator that onnxruntime has for each. Otherwise
+# torch would write a dozen operators, which cost more than the few frames they compute.
 
 
 def _operator(name: str, inputs: tuple[Any, ...], attributes: dict[str, Any], like: Tensor, version: int = 1) -> Tensor:
@@ -118,9 +118,9 @@ def join_heads(x: Tensor) -> Tensor:
 
 
 def attention(q: Tensor, k: Tensor, v: Tensor, heads: int, seen: Tensor | None = None) -> Tensor:
-    """Return attention (N, T, D) of q (N, T, D) over k, v (N, S, D); `seen` (N, S) is True where it may look.
+    """Return attention (N, T, D) of q (N, T, D) over k, v (N, S, D); `seen` (N, S) is True where q may attend.
 
-    In 32 bits where a CPU trains in 16: its gradient is slow in those.
+    A CPU that trains in 16 bits computes it in 32 bits, because the gradient is slow in 16.
     """
     if torch.compiler.is_exporting():
         mask = None if seen is None else seen.to(torch.int32)
@@ -145,7 +145,7 @@ class Attention(nn.Module):
         self.out = nn.Linear(width, width)
 
     def forward(self, x: Tensor, memory: Tensor, seen: Tensor | None = None) -> Tensor:
-        """Return (B, T, D). `seen` (B, S) is True where the memory may be looked at, at least once per row."""
+        """Return (B, T, D). `seen` (B, S) is True where `x` may attend to the memory, at least once per row."""
         if torch.compiler.is_exporting():
             return self._exported(x, memory, seen)
         k, v = self.key_value(memory).chunk(2, dim=-1)
@@ -153,7 +153,7 @@ class Attention(nn.Module):
         return out
 
     def _exported(self, x: Tensor, memory: Tensor, seen: Tensor | None) -> Tensor:
-        """Return `forward` in as few operators as possible; terms of weights alone are folded when a graph loads."""
+        """Return `forward` in as few operators as possible; terms of only weights are folded when a graph loads."""
         own, other = self.query, self.key_value
         if memory is x:  # one operator with the projection of queries, keys and values
             weight, bias = torch.cat([own.weight, other.weight]), torch.cat([own.bias, other.bias])
@@ -236,12 +236,15 @@ class FeedForward(nn.Module):
 class Modulation(nn.Module):
     """adaLN (Peebles and Xie 2023; A.1): shifts, scales and gates of a block, computed from a condition.
 
-    Ours: a new one leaves its block a plain one (shifts about 0, scales and gates about 1), because gates of 0, with
-    which DiT begins, only delay learning at these depths.
+    Ours: an untrained modulation hardly changes its block (shifts about 0, scales and gates about 1), because gates of
+    0, with which DiT begins, only delay learning at these depths.
     """
 
     def __init__(self, width: int, kinds: str) -> None:
-        """Make vectors from a condition, both of `width`, one per letter of `kinds`: s(hift), (s)c(ale), g(ate)."""
+        """Create a layer from a condition to one vector per letter of `kinds`, s(hift), (s)c(ale) or g(ate).
+
+        The condition and each vector have `width` numbers.
+        """
         super().__init__()
         self.parts = len(kinds)
         self.linear = nn.Linear(width, self.parts * width)
@@ -250,12 +253,12 @@ class Modulation(nn.Module):
             self.linear.bias.copy_(torch.tensor([float(kind != "s") for kind in kinds]).repeat_interleave(width))
 
     def forward(self, condition: Tensor) -> Tensors:
-        """Return one vector (..., size) per letter, of a condition (..., D) that SiLU was applied to."""
+        """Return one vector (..., size) per letter from a condition (..., D) that SiLU was applied to."""
         parts: Tensors = self.linear(condition).chunk(self.parts, dim=-1)
         return parts
 
     def of_tokens(self, condition: Tensor) -> Tensors:
-        """Return (N, 1, size) per letter of a condition (N, D), for all tokens of a sample."""
+        """Return one vector (N, 1, size) per letter from a condition (N, D), for all tokens of a sample."""
         parts: Tensors = self.linear(condition)[:, None].chunk(self.parts, dim=-1)
         return parts
 
@@ -273,15 +276,15 @@ def weighted_mean(x: Tensor, weights: Tensor | None) -> Tensor:
 
 
 def windows(x: Tensor, size: int) -> Tensor:
-    """Return (B, T, size, D) of x (B, T, D): each frame and those before it, the first one repeated (A.2)."""
+    """Return windows (B, T, size, D) of x (B, T, D): each frame and those before it, the first one repeated (A.2)."""
     return torch.cat([x[:, :1].expand(-1, size - 1, -1), x], dim=1).unfold(1, size, 1).transpose(-1, -2)
 
 
 class CrossAttention(nn.Module):
-    """A query that looks at a few tokens, then a feed-forward; pre-norm, residual.
+    """Cross attention of a query over a few tokens, then a feed-forward; pre-norm, residual.
 
-    Keys and values of a token do not depend on its slot: the meaning of a slot is added to the finished key. So a
-    stream projects every token once, however long it stays in view.
+    Projecting a token does not depend on its slot: a learned vector of the slot is added to the finished key and value.
+    So a stream projects every token once, however long it stays in view.
     """
 
     def __init__(self, width: int, hidden: int, heads: int, slots: int) -> None:
@@ -301,7 +304,7 @@ class CrossAttention(nn.Module):
         return out
 
     def forward(self, x: Tensor, keys: Tensor) -> Tensor:
-        """Return (N, D) of x (N, D) looking at keys (N, slots, 2D)."""
+        """Return (N, D) of queries x (N, D) over `keys` (N, slots, 2D)."""
         query, (k, v) = self.query(self.norm(x))[:, None], (keys + self.slots).chunk(2, dim=-1)
         x = x + self.out(attention(query, k, v, self.heads)[:, 0])
         out: Tensor = x + self.ffn(self.ffn_norm(x))

@@ -1,27 +1,27 @@
 """A listener in a child process: the same `step`, frames one way, plans the other. Both ends are in this file.
 
-In one process networks and the servo loop share a lock, and ticks slip by tens of milliseconds. So the child owns the
-model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime for it.
+In one process, networks and the servo loop would share a lock, and ticks would be late by tens of milliseconds. So the
+child owns the model and its threads (cores - 1 at most), and the servo process loads neither torch nor onnxruntime.
 
-A listener that is loaded tries, while the head eases in, whether more than one thread is faster, and measures what a
-plan takes on this machine. From that, and from how late the source has been for half a second, the parent chooses its
-hop. Every ten seconds the choice is compared with what has been measured since: a hop that does not fit any more is
-replaced by a shorter one, never by a longer one, so that it settles.
+While the head eases in, the loaded listener tries whether more than one thread is faster, and measures the duration of
+a plan on this machine. From that, and from the delay of the source over half a second, the parent chooses the hop.
+Every ten seconds the choice is compared with newer measurements: a hop that does not fit any more is replaced by a
+shorter one, never by a longer one, so that it settles.
 
-`processes.LIMITS["listener"]` says when a child counts as hung and when it is started again. Signs of life:
+`processes.LIMITS["listener"]` sets when a child counts as hung and when it is restarted. Signs of life:
 
     starting, loading   processor time of its main thread: loading from a slow disk uses some all the time, a child that
-                        is stopped or waits for a lock uses none. Where the system does not report it, always.
+                        is stopped or waits for a lock uses none. If the system does not report it, always alive.
     running             an answer to each frame
 
-    parent -> child     (name, seed, calmness, engine), then SpeakerFrame after SpeakerFrame; between them an
-                        int: the hop, which it waits for and which may change; at any time another Calmness
+    parent -> child     (name, seed, calmness, engine), then one SpeakerFrame after another; between them an
+                        int: the hop, which the child waits for and which may change; at any time another Calmness
     child -> parent     (kind, value)
-        loaded          it can be loaded; value names its engine
-        probed          value is a `Probe`; it waits for its hop
-        ready           it listens
-        step            a frame was taken: value is a `thread.Stepped`
-        error           it cannot listen, and value says why
+        loaded          the listener is loaded; value names its engine
+        probed          value is a `Probe`; the child waits for its hop
+        ready           the child listens
+        step            a frame was processed; value is a `thread.Stepped`
+        error           the child cannot listen; value is the reason
 """
 
 from __future__ import annotations
@@ -47,12 +47,12 @@ from sfms_robot.processes import LIMITS, START_LIMIT_S, Child, Ended, ParentPipe
 from sfms_robot.signals.quantiles import Quantiles
 
 REVIEW_S: Final = 10.0
-SETTLED_FRAMES: Final = FRAME_HZ // 2  # after so many a source has measured how late it is
-_LOOK_S: Final = 0.1  # between two checks of a child that loads, while nothing else runs
+SETTLED_FRAMES: Final = FRAME_HZ // 2  # after this many frames a source has measured its delay
+_LOOK_S: Final = 0.1  # longest time between two checks of a child that loads, while nothing else runs
 # Names of phases in statistics.
 _STATES: Final = {"backing off": "starting", "loading": "building", "running": "listening"}
 
-NICE: Final = 5  # below the servo loop, which needs a core for a fraction of a millisecond, but at once
+NICE: Final = 5  # lower priority than the servo loop, which needs a core for a fraction of a millisecond, but at once
 AWAKE_S: Final = 0.02
 PROBE_S: Final = 0.5
 PROBE_PLANS: Final = 12
@@ -61,14 +61,14 @@ log = logging.getLogger(__name__)
 
 
 class ListenerProcess:
-    """`ports.PlanFeed` over a child process that starts at once; `wait_loaded` waits until it can be relied upon.
+    """A `ports.PlanFeed` over a child process that starts at once; `wait_loaded` waits until it is loaded.
 
     Args:
-        name: what `registry.load_listener` takes: a shipped listener, a folder, or a kind of another package.
-        seed: of the stream.
+        name: as for `registry.load_listener`: a shipped listener, a folder, or a kind of another package.
+        seed: seed of the stream.
         calmness: rates of the events of a listener that decides them.
-        engine: what its networks are computed by.
-        clock: seconds, for `wait_loaded`; `push` and `poll` are given theirs.
+        engine: engine that computes its networks.
+        clock: returns seconds, for `wait_loaded`; `push` and `poll` get the time as an argument.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class ListenerProcess:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._name, self._calmness, self._wanted, self._clock = name, calmness, engine, clock
-        self._seeds = itertools.count(seed)  # a child that is started again gets another one
+        self._seeds = itertools.count(seed)  # a restarted child gets another seed
         self._engine: str | None = None
         self._step_ms = Quantiles()
         self._skipped = self._pushed = 0
@@ -89,19 +89,19 @@ class ListenerProcess:
         self._failure: str | None = None
         self._latencies: Callable[[Probe], Latencies] | None = None
         self._choice: HopChoice | None = None
-        self._probed: Probe | None = None  # what the choice in force was made by
+        self._probed: Probe | None = None  # the measurements that the current choice is based on
         self._review_s = math.inf
         self._supervised = Supervised("listener", LIMITS["listener"], self._start)
 
     def calm(self, calmness: Calmness) -> None:
-        """Use other rates from the next frames on. Never blocks; a listener that decides nothing ignores them."""
+        """Use other rates from the next frames on. Never blocks; a listener that decides no events ignores them."""
         self._calmness = calmness
         self._supervised.child.send(calmness)
 
     def wait_loaded(self, limit_s: float = START_LIMIT_S) -> None:
         """Block until the listener is loaded, and restart a child that hangs.
 
-        Raises ModelError with the child's own message where it cannot be loaded.
+        Raises ModelError with the child's own message if it cannot be loaded.
         """
         began_s = self._clock()
         while self._supervised.phase in ("starting", "backing off") and self._clock() - began_s <= limit_s:
@@ -117,12 +117,12 @@ class ListenerProcess:
             raise ModelError(f"the listener process was not loaded after {limit_s:g} s")
 
     def choose_hop_by(self, source_latency_s: Callable[[], float], lead_s: float, tick_s: float) -> None:
-        """Choose the hop once it is known what a plan takes here. Without this call the listener keeps its own.
+        """Choose the hop once the duration of a plan here is known. Without this call the listener keeps its own.
 
         Args:
-            source_latency_s: returns how late the source is by now.
+            source_latency_s: returns the current delay of the source.
             lead_s: longest lead of a joint.
-            tick_s: of the loop.
+            tick_s: period of the loop.
         """
         self._latencies = lambda probe: Latencies(
             horizon=probe.horizon,
@@ -134,7 +134,7 @@ class ListenerProcess:
         )
 
     def push(self, frame: SpeakerFrame, now_s: float) -> None:
-        """Send a frame. Never blocks; of frames that a child does not take, the oldest are dropped and counted."""
+        """Send a frame. Never blocks; of frames that a child does not read, the oldest are dropped and counted."""
         if self._supervised.phase not in ("loading", "running"):
             return
         self._pushed += 1
@@ -145,7 +145,7 @@ class ListenerProcess:
         self._unanswered += 1 - dropped
 
     def poll(self, now_s: float) -> Sequence[Plan]:
-        """Return plans that came. Never blocks, never raises: a child that died or hangs is restarted."""
+        """Return plans that have arrived. Never blocks, never raises: a child that died or hangs is restarted."""
         plans = []
         while (message := self._supervised.child.receive()) is not None:
             plan = self._take(message, now_s)
@@ -157,7 +157,7 @@ class ListenerProcess:
 
     @property
     def lost(self) -> bool:
-        """Return whether it hangs, restarts, is given up, or always comes too late."""
+        """Return whether the listener hangs, restarts, was given up, or is always too late."""
         return self._supervised.away or self._lateness.lasting
 
     def statistics(self) -> Facts:
@@ -182,7 +182,7 @@ class ListenerProcess:
 
     def _start(self) -> Child:
         self._unanswered = 0
-        self._probe: Probe | None = None  # that is to be answered with a hop
+        self._probe: Probe | None = None  # the probe that is to be answered with a hop
         self._lateness = Lateness()
         order = (self._name, next(self._seeds), self._calmness, self._wanted)
         return Child(f"{__name__}:main", order, name="listener", kept=MOST_WAITING)
@@ -218,7 +218,7 @@ class ListenerProcess:
 
     def _check(self, now_s: float) -> None:
         if self._probe is not None:
-            self._supervised.phase_s = 0.0  # it waits for its hop
+            self._supervised.phase_s = 0.0  # the child waits for its hop
         if self._supervised.phase == "running":
             alive = self._answered or not self._unanswered
         else:
@@ -228,7 +228,7 @@ class ListenerProcess:
         self._supervised.check(now_s, alive, failure)
 
     def _send_hop(self) -> None:
-        """Answer a probe, as soon as the source has settled."""
+        """Answer a probe with a hop, as soon as the source has settled."""
         probe = self._probe
         if probe is None or (self._latencies is not None and self._pushed < SETTLED_FRAMES):
             return
@@ -247,7 +247,7 @@ class ListenerProcess:
             )
 
     def _review(self, now_s: float) -> None:
-        """Choose a shorter hop where the one in force does not fit what is measured by now."""
+        """Choose a shorter hop if the current one does not fit the newest measurements."""
         if now_s < self._review_s or self._supervised.phase != "running":
             return
         self._review_s = now_s + REVIEW_S
@@ -296,20 +296,20 @@ def main() -> None:
     except RobotError as error:
         parent.send(("error", str(error)))
         return
-    while inbox.hop is None:  # awake again and again: for the parent, a child that uses no processor time hangs
+    while inbox.hop is None:  # wakes repeatedly: a child that uses no processor time counts as hung
         time.sleep(AWAKE_S)
     listen(listener, seed, inbox, parent.send)
 
 
 def threads() -> int:
-    """Return the number of threads that the child may use: one core is the servo loop's."""
+    """Return the number of threads that the child may use: one core is left to the servo loop."""
     return max(1, cores() - 1)
 
 
 def use_threads(listener: Listener, most: int) -> bool:
-    """Let a listener's networks use one thread or `most`, whichever makes plans faster here; return whether `most`.
+    """Set a listener's networks to one thread or `most`, whichever is faster here; return True for `most`.
 
-    Blocks for half of `PROBE_S` each where there is a choice.
+    Blocks for half of `PROBE_S` for each of the two, if there is a choice.
     """
     from sfms_robot.listeners.registry import engine_name, set_threads
 
@@ -327,10 +327,10 @@ def use_threads(listener: Listener, most: int) -> bool:
 def plan_times_s(
     listener: Listener, limit_s: float = PROBE_S, wait: Callable[[float], object] = time.sleep
 ) -> tuple[float, float]:
-    """Return median and 99th percentile of what a plan takes, on silence; of all steps where no plan was made.
+    """Return median and 99th percentile of the duration of a plan, on silence; of all steps if no plan was made.
 
-    At the pace of a run: between two frames caches cool, and a plan takes half as long again. Blocks for `limit_s`, or
-    `PROBE_PLANS` plans, and one step more.
+    Steps come at the pace of a run: caches are overwritten between two frames, and a plan takes half as long again.
+    Blocks for `limit_s`, or `PROBE_PLANS` plans, and one step more.
     """
     memory = listener.start(0)
     planned_s: list[float] = []

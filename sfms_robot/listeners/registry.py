@@ -1,4 +1,4 @@
-"""Listeners by name: shipped ones, folders, and those of other packages. torch is imported only where it is needed."""
+"""Listeners by name: shipped, in a folder, or in another package. torch is imported only where it is needed."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ def load_listener(
     threads: int | None = None,
     device: Device = "cpu",
 ) -> Listener:
-    """Return a listener: by its shipped name, from a folder with config.yaml and weights, or from another package.
+    """Load a listener by its shipped name, from a folder with config.yaml and weights, or from another package.
 
-    Shipped ones are `engine.RunsOnEngine`s.
+    Shipped listeners are `engine.RunsOnEngine`s.
 
     Args:
         calmness: rates of the events of a listener that decides them.
-        engine: what computes its networks (`engine`); auto: onnx where it can be, else torch.
-        threads: for its networks; None: one, and with torch as many as it is set to.
-        device: cuda: many streams at once on a GPU (`torch_engine.BatchEngine`).
+        engine: engine of its networks (`engine`); auto: onnx if possible, else torch.
+        threads: number of threads of its networks; None: one with onnx, the number that torch is set to with torch.
+        device: cuda computes many streams at once on a GPU (`torch_engine.BatchEngine`).
 
     Raises ConfigError or ModelError.
     """
@@ -56,7 +56,7 @@ def load_listener(
 def load_folder(
     folder: Path, engine: EngineName = "auto", threads: int | None = None, device: Device = "cpu"
 ) -> SfmsListener | ArigListener:
-    """Return the model of motion of a folder with config.yaml and model.safetensors. Raises ConfigError, ModelError."""
+    """Load the model of motion of a folder with config.yaml and model.safetensors. Raises ConfigError, ModelError."""
     settings = load_config(folder)
     if device != "cpu" and engine == "onnx":
         raise ConfigError(f"--engine onnx: computes on processors, --device {device} does not (valid: auto, torch)")
@@ -78,25 +78,25 @@ def load_folder(
 
 
 def engine_name(listener: Listener) -> str | None:
-    """Return what computes its networks, in words; None for a listener of another package."""
+    """Return the name of the engine of a listener's networks; None for a listener of another package."""
     engine: Engine | None = getattr(listener, "engine", None)
     return None if engine is None else engine.name
 
 
 def set_threads(listener: Listener, threads: int) -> None:
-    """Use so many threads from now on; a listener of another package stays unchanged."""
+    """Set the number of threads of a listener; one of another package stays unchanged."""
     engine: Engine | None = getattr(listener, "engine", None)
     if engine is not None:
         engine.set_threads(threads)
 
 
 def hops_of(listener: Listener) -> tuple[int, ...]:
-    """Return the hops that it can be run with; its own alone, for one that names none."""
+    """Return the hops that a listener supports: its current hop if it has no `hops`."""
     return tuple(getattr(listener, "hops", (listener.hop,)))
 
 
 def at_hop(listener: Listener, hop: int) -> Listener:
-    """Return the listener, planning every `hop` frames, one of `hops_of`."""
+    """Return the listener with a plan every `hop` frames; `hop` is one of `hops_of`."""
     return listener if hop == listener.hop else cast(Listener, cast(Any, listener).at_hop(hop))
 
 

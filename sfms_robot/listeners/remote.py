@@ -1,13 +1,13 @@
 """A listener on another machine, as the loop sees it: frames go out, plans come back (`ports.PlanFeed`).
 
-    joining     it requests a stream, again and again, until a server answers
+    joining     it requests a stream repeatedly until a server answers
     listening   frames go to its stream; plans come through a jitter buffer
-    hung        frames went out, and nothing has come back for `HUNG_S`; frames and requests continue
-    refused     the server has refused, and said why; requested again after `REFUSED_S`: another one may be there then
+    hung        frames were sent, and nothing has come back for `HUNG_S`; frames and requests continue
+    refused     the server has refused with a reason; the next request is after `REFUSED_S`: another one may be there
 
-A server that was started again knows no streams of before, reports that, and is joined again. The memory of a stream is
-the server's: after joining again the listener has heard nothing yet. Meanwhile plans run out, the face eases to
-neutral, and the head lives on, as with any listener that is lost (docs/safety.md).
+A server that was restarted has none of the earlier streams; it reports that, and is joined again. The server keeps the
+memory of a stream: after joining again the listener starts without memory. Meanwhile plans run out, the face eases to
+neutral, and idle motion of the head continues, as with any lost listener (docs/safety.md).
 
 Keys of zenoh:
 
@@ -15,7 +15,7 @@ Keys of zenoh:
     sfms/listen/NAME/STREAM/up      frames, and notices, from the robot
     sfms/listen/NAME/STREAM/down    plans, and notices, to it
 
-Frames and plans are never waited for: what the network does not take at once is dropped, since a newer one follows.
+Sending never waits: frames and plans that the network does not accept at once are dropped, since newer ones follow.
 """
 
 from __future__ import annotations
@@ -55,22 +55,22 @@ if TYPE_CHECKING:
     import zenoh
 
 HUNG_S: Final = 1.0
-JOIN_S: Final = 0.25  # from one request to the next
+JOIN_S: Final = 0.25  # time from one request to the next
 REFUSED_S: Final = 5.0
-AWAY_S: Final = 5.0  # for the first answer; after that the head begins without
-_SHOWN: Final = 64  # events that are remembered
+AWAY_S: Final = 5.0  # longest wait for the first answer; after that the head begins without the listener
+_SHOWN: Final = 64  # number of past events that are remembered
 _WAIT_S: Final = 0.01
 
 log = logging.getLogger(__name__)
 
 
 class RemoteListener:
-    """`ports.PlanFeed` over a link.
+    """A `ports.PlanFeed` over a link.
 
     Args:
-        name: of the served listener.
+        name: name of the served listener.
         link: carries messages; tests have another one.
-        seed, calmness: as of `process.ListenerProcess`.
+        seed, calmness: as in `process.ListenerProcess`.
     """
 
     def __init__(self, name: str, link: ZenohLink, seed: int, calmness: Calmness | None = None) -> None:
@@ -84,16 +84,16 @@ class RemoteListener:
         self._step_ms, self._rtt_ms, self._delay_ms = Quantiles(), Quantiles(), Quantiles()
         self._shown = deque[tuple[str, float]](maxlen=_SHOWN)
         self._asked_s = -math.inf
-        self._waiting_since_s: float | None = None  # for an answer to a frame
+        self._waiting_since_s: float | None = None  # time since which an answer to a frame is missing
         self._skipped = self._refused_messages = 0
         self._joins = self._losses = 0
 
     # --- before the loop ---------------------------------------------------------------------------------------------
 
     def wait_loaded(self, limit_s: float = AWAY_S) -> None:
-        """Block until the server has answered, `limit_s` at most; after that the head begins without, with a warning.
+        """Block until the server answers, `limit_s` at most; after that log a warning: the head begins without it.
 
-        Raises ConfigError where the server refuses for good, or the link can never be opened.
+        Raises ConfigError if the server refuses for good, or the link can never be opened.
         """
         end_s = time.monotonic() + limit_s
         while self._welcome is None and (now_s := time.monotonic() - end_s) < 0:  # before loop time, which begins at 0
@@ -121,17 +121,17 @@ class RemoteListener:
             self._waiting_since_s = now_s
 
     def poll(self, now_s: float) -> Sequence[Plan]:
-        """Return plans whose turn it is. Never blocks, never raises."""
+        """Return plans that are due. Never blocks, never raises."""
         self._attend(now_s)
         silent_s = 0.0 if self._waiting_since_s is None else now_s - self._waiting_since_s
-        if self._state == "listening" and silent_s > HUNG_S:  # though frames went out
+        if self._state == "listening" and silent_s > HUNG_S:  # although frames were sent
             log.warning("%s%s has not answered for %.1f s", PREFIX, self._name, silent_s)
             self._lose("hung")
         return [self._with_new_events(plan) for plan in self._buffer.take(now_s)]
 
     @property
     def lost(self) -> bool:
-        """Return whether it does not answer: not joined (yet), hung, refused."""
+        """Return whether the listener does not answer: not joined (yet), hung, refused."""
         return self._state != "listening"
 
     def calm(self, calmness: Calmness) -> None:
@@ -141,7 +141,7 @@ class RemoteListener:
             self._link.send(words_message(Notice("calm", calmness=calmness.model_dump())))
 
     def statistics(self) -> Facts:
-        """Return the figures of `ports.PlanFeed`, and of the link: delays [ms], and counts of what was lost.
+        """Return the figures of `ports.PlanFeed`, and of the link: delays [ms], and counts of lost messages.
 
         `state` is joining, listening, hung or refused; `restarts` counts streams begun after the first.
         """
@@ -180,7 +180,7 @@ class RemoteListener:
     # --- messages --------------------------------------------------------------------------------------------------
 
     def _attend(self, now_s: float) -> None:
-        """Handle what came, and request a stream where that is due."""
+        """Handle received messages, and request a stream if a request is due."""
         for age_s, message in self._link.received():
             try:
                 if message[:1] == b"{":
@@ -213,7 +213,7 @@ class RemoteListener:
 
     def _join(self, welcome: Welcome, now_s: float) -> None:
         if self._welcome is not None and welcome.stream == self._welcome.stream:
-            return  # the answer to an asking during an outage: the stream is still there
+            return  # the answer to a request during an outage: the stream is still there
         if not OURS.fits(welcome.interface):
             reason = f"this robot is {OURS}; server {welcome.server} is {welcome.interface}"
             self._listen_to(Refusal(reason, final=True), now_s)
@@ -253,7 +253,7 @@ class RemoteListener:
             self._welcome = None
 
     def _with_new_events(self, plan: Plan) -> Plan:
-        """Return the plan without events that one before has brought: each is sent with several plans."""
+        """Return the plan without events of earlier plans: each event is sent with several plans."""
         fresh: list[ListenerEvent] = []
         for event in plan.events:
             key = event.kind, round(event.start_s - self._buffer.shift_s, 3)
@@ -266,20 +266,20 @@ class RemoteListener:
 # --- Link -------------------------------------------------------------------------------------------------------------
 
 ROOT: Final = "sfms/listen"
-ANSWER_S: Final = 2.0  # that the answer to a request may take
+ANSWER_S: Final = 2.0  # longest wait for the answer to a request
 MOST_RECEIVED: Final = 1000  # messages that wait for `received`; the oldest are dropped
 
 
 def listen_key(name: str, *parts: str) -> str:
-    """Return a key of a served listener: "join", on which streams are requested, or a stream and "up" or "down"."""
+    """Return a key of a served listener: of "join", where streams are requested, or of a stream and "up" or "down"."""
     return "/".join((ROOT, name, *parts))
 
 
 class ZenohLink:
-    """The way to the listener that is served as `name`. Nothing here blocks.
+    """A link to the listener that is served as `name`. No method blocks.
 
     Attributes:
-        where: the router, for people.
+        where: the router as text, for messages to people.
     """
 
     def __init__(self, name: str, router: Router) -> None:
@@ -292,11 +292,11 @@ class ZenohLink:
 
     @property
     def problem(self) -> str | None:
-        """Return why no message will ever be carried; None as long as one may."""
+        """Return the reason why the link can never carry a message; None as long as it may."""
         return self._connection.problem
 
     def ask(self, message: bytes) -> None:
-        """Send a request to the servers of this name; every answer is among `received`."""
+        """Send a request to the servers of this name; `received` returns every answer."""
         session = self._connection.session
         if session is not None:
             session.get(listen_key(self._name, "join"), self._on_reply, payload=message, timeout=ANSWER_S)
@@ -314,7 +314,7 @@ class ZenohLink:
             listen_key(self._name, stream, "up"),
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME,
-            express=True,  # not gathered into larger packets: that would take time
+            express=True,  # messages are not gathered into larger packets, which would take time
         )
 
     def send(self, message: bytes) -> None:
@@ -323,7 +323,7 @@ class ZenohLink:
             self._publisher.put(message)
 
     def received(self) -> Sequence[tuple[float, bytes]]:
-        """Return what came since the last call, each message with its age [s], in the order of arrival."""
+        """Return (age [s], message) of all messages since the last call, in the order of arrival."""
         now_s = time.monotonic()
         taken = [self._received.popleft() for _ in range(len(self._received))]
         return [(now_s - came_s, message) for came_s, message in taken]

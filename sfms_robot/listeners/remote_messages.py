@@ -1,7 +1,7 @@
 """Messages between a robot and a server of listeners: values in, bytes out, and back. Opens no socket.
 
-A message that begins with "{" is JSON (UTF-8), any other is binary, little-endian; docs/guide/remote.md says which goes
-where.
+A message that begins with "{" is JSON (UTF-8), any other is binary, little-endian; docs/guide/remote.md lists the route
+of each.
 
     frame      uint8    kind, 1
                uint8    protocol, 1
@@ -9,24 +9,24 @@ where.
                uint32   number: index of the frame in loop time, frame 0 ends at 0.04 s
                float64  time [s]: SpeakerFrame.time_s, loop time
                float64  sent [s]: by the robot's clock
-               float64  sent [s]: the same instant by the server's clock, as far as the robot knows it; NaN: not yet
+               float64  sent [s]: the same instant by the server's clock, as estimated by the robot; NaN: unknown yet
                uint16   samples of audio, uint16 samples of own voice; int16 PCM of both, 16 kHz
                float64  time of the face, 58 float32 (pose 6, blendshapes 52); 3 float32 jaw; float64 attention;
-                        3 float32 place: each where its flag says so
+                        3 float32 place: each only if its flag is set
 
     plan       uint8    kind, 2
                uint8    protocol, 1
                uint16   flags: 2 jaw
                uint32   number of the frame that it answers
                float64  that frame's `sent`, by the robot's clock
-               float64  when that frame came, and float64 when this was sent, by the server's clock
+               float64  time when that frame came, and float64 time when this plan was sent, by the server's clock
                float32  duration of the step [ms]
                uint16   frames H of the plan, uint16 bytes of JSON
-               float64  made at; H float64 times, loop time; H x 58 float32, H x 3 float32 jaw where its flag says so
+               float64  made at; H float64 times, loop time; H x 58 float32, H x 3 float32 jaw only if its flag is set
                JSON     {"events": [...], "hazards_hz": {...}}: also the events of the two plans before, since a plan
                         may be lost
 
-Sound has the resolution of a sound card: 65,536 steps, at most 1.0. Everything else arrives bit for bit.
+Sound has the resolution of a sound card: 65,536 steps, at most 1.0. All other values arrive bit for bit.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from sfms_robot.frames import (
 PROTOCOL: Final = 1
 FRAME, PLAN = 1, 2
 FACE, JAW, OWN_VOICE, ATTENTION, PLACE = 1, 2, 4, 8, 16
-MOST_PLANNED: Final = 256  # frames of a plan
+MOST_PLANNED: Final = 256  # most frames of a plan
 LONGEST_JSON: Final = 16_384
 
 _START: Final = struct.Struct("<BB")
@@ -75,7 +75,7 @@ _PCM: Final = 32_768.0
 
 @dataclass(frozen=True)
 class SentFrame:
-    """A frame on its way. `sent_s` by the robot's clock, `server_sent_s` by the server's, NaN where that is unknown."""
+    """A sent frame. `sent_s` is by the robot's clock, `server_sent_s` by the server's, NaN if that is unknown."""
 
     number: int
     frame: SpeakerFrame
@@ -134,7 +134,7 @@ def parse_frame(data: bytes) -> SentFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class SentPlan:
-    """A plan on its way back; `echo_s` is the `sent_s` of the frame it answers, the others by the server's clock."""
+    """A sent plan. `echo_s` is the `sent_s` of the frame it answers, `came_s` and `sent_s` by the server's clock."""
 
     number: int
     plan: Plan
@@ -156,7 +156,7 @@ _DECIDED: Final = TypeAdapter(Decided)
 
 
 def plan_message(sent: SentPlan, earlier: Events = ()) -> bytes:
-    """Return a plan as bytes. `earlier`: events that plans before have brought."""
+    """Return a plan as bytes. `earlier`: events of earlier plans, which are sent again."""
     plan = sent.plan
     decided = {"events": [asdict(event) for event in (*earlier, *plan.events)], "hazards_hz": dict(plan.hazards_hz)}
     words = orjson.dumps(decided, option=orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_NON_STR_KEYS)
@@ -191,9 +191,9 @@ def parse_plan(data: bytes) -> SentPlan:
 # --- Words ------------------------------------------------------------------------------------------------------------
 
 
-@validated(frozen=True, kw_only=True, config=ConfigDict(extra="ignore"))  # keys of a later protocol
+@validated(frozen=True, kw_only=True, config=ConfigDict(extra="ignore"))  # a later protocol may have further keys
 class Interface:
-    """The properties that both sides must share; as text, for people."""
+    """The properties that both sides must share; `str` returns them as text for people."""
 
     protocol: int = PROTOCOL
     version: str = __version__
@@ -203,14 +203,14 @@ class Interface:
     channels: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return it as words."""
+        """Return the properties as text."""
         return (
             f"sfms-robot {self.version}, protocol {self.protocol}, {self.frame_hz} frames a second, "
             f"{self.audio_hz} Hz, {self.motion} ({len(self.channels)} channels)"
         )
 
     def fits(self, other: Interface) -> bool:
-        """Return whether both understand one another: all but the version of the program must be the same."""
+        """Return whether both sides are compatible: everything except the program's version must be the same."""
         return replace(self, version="") == replace(other, version="")
 
 
@@ -221,7 +221,7 @@ _STRICT: Final = ConfigDict(strict=True, extra="forbid")
 
 @validated(frozen=True, config=_STRICT)
 class Join:
-    """A robot's request for a stream. `client` tells robots apart, `calmness` is `config.Calmness` as a mapping."""
+    """A robot's request for a stream. `client` identifies the robot, `calmness` is `config.Calmness` as a mapping."""
 
     type: Literal["join"] = field(default="join", kw_only=True)
     client: str
@@ -232,7 +232,7 @@ class Join:
 
 @validated(frozen=True, kw_only=True, config=_STRICT)
 class Welcome:
-    """A stream was begun: its frames go under `stream`. `server` changes when the server is started again."""
+    """The answer that a stream was begun: its frames go to `stream`. `server` changes when the server is restarted."""
 
     type: Literal["welcome"] = "welcome"
     stream: str
@@ -245,7 +245,7 @@ class Welcome:
 
 @validated(frozen=True, config=_STRICT)
 class Refusal:
-    """No stream was begun, and why; `final`: asking again cannot help."""
+    """The answer that no stream was begun, with the reason; `final`: another request cannot help."""
 
     type: Literal["refusal"] = field(default="refusal", kw_only=True)
     reason: str
@@ -254,7 +254,7 @@ class Refusal:
 
 @validated(frozen=True, config=_STRICT)
 class Notice:
-    """`kind` "unknown": there is no such stream (any more); "skipped": `frames` were left out; "leave", "calm"."""
+    """A notice of `kind` "unknown" (no such stream, or no longer), "skipped" (`frames` left out), "leave" or "calm"."""
 
     type: Literal["notice"] = field(default="notice", kw_only=True)
     kind: str
@@ -285,7 +285,7 @@ def parse_words(data: bytes) -> Words:
 
 
 class _Reader:
-    """The bytes of a message, read from front to back. `what` names it in errors."""
+    """A reader of the bytes of a message, from front to back. `what` names the message in errors."""
 
     def __init__(self, data: bytes, kind: int, form: struct.Struct, what: str) -> None:
         self._data, self._at, self._what = data, 0, what
@@ -306,7 +306,7 @@ class _Reader:
         return taken
 
     def array(self, kind: str, count: int, finite: bool = True) -> NDArray[Any]:
-        """Return the next `count` numbers; `kind` is a type of numpy's, little-endian."""
+        """Return the next `count` numbers; `kind` is a numpy type, little-endian."""
         values = np.frombuffer(self.bytes(count * np.dtype(kind).itemsize), kind)
         if finite and not np.isfinite(values).all():
             raise PacketError(f"{self._what}: a value is not finite")

@@ -1,26 +1,26 @@
-"""Times of a listener on another machine: its clock relative to ours, and plans that come unevenly (`JitterBuffer`).
+"""Times of a listener on another machine: its clock relative to ours, and plans that arrive unevenly (`JitterBuffer`).
 
 Clock offset and delay of a round trip are those of NTP (RFC 5905, section 8). A message leaves at t1 of our clock and
 arrives at t2 of the server's; its answer leaves at t3 of the server's and arrives at t4 of ours:
 
     offset = ((t2 - t1) + (t3 - t4)) / 2        delay = (t4 - t1) - (t3 - t2)
 
-The offset is wrong by half the difference between the two ways, at most by delay / 2, so the sample with the least
-delay of the last seconds is used. Clocks drift apart, so an old sample is dropped.
+The error of the offset is half the difference between the two ways, at most delay / 2. So the sample with the least
+delay of the last seconds is used. Clocks drift apart, so old samples are dropped.
 
 The buffer delays plans so that the next one is always there in time, in order and each once. A plan of H frames is
-followed until the next one comes, hop T + delay after its own last speaker frame, and plans know (H - 1) T of the
-future; T of it where they are single frames, which the timeline plays one late. What the delay's 95th percentile of
-the last seconds needs beyond that is added to the times of all plans:
+played until the next one comes, hop T + delay after its own last speaker frame. Plans cover (H - 1) T of the future;
+plans of a single frame cover T, because the timeline plays them one frame late. If the 95th percentile of the delay
+over the last seconds needs more than that, the difference is added to the times of all plans:
 
     shift = hop T + delay p95 + MARGIN - max(H - 1, 1) T, at least 0
 
-So plans of eight frames are mostly not shifted at all, since they reach further than networks are late, and those of
-one frame by the delay itself. The shift grows at once, where plans come later than it allows for, and shrinks slowly:
-a face that is a little late is not seen to be, one that hurries is.
+So plans of eight frames are mostly not shifted, since they cover more time than networks delay them, and plans of one
+frame are shifted by the delay itself. The shift grows at once if plans come later than it allows, and shrinks slowly:
+viewers do not notice a face that is a little late, but they notice one that hurries.
 
-Plans that overtook one another are put in order while there is time: a plan is held back for one that is missing until
-its own first frame is due.
+Plans that overtook one another are put in order while there is time: a plan waits for a missing one until its own first
+frame is due.
 """
 
 from __future__ import annotations
@@ -36,18 +36,18 @@ import numpy as np
 from sfms_robot.frames import FRAME_S, Plan
 
 WINDOW_S: Final = 10.0
-SET_S: Final = 1.0  # an offset so far from the one believed: a clock was set, or the server is another one
+SET_S: Final = 1.0  # an offset that differs by more than this: a clock was set, or the server is another one
 
-DELAYS: Final = 128  # that are remembered
+DELAYS: Final = 128  # number of delays that are kept
 PERCENT: Final = 95.0
-MARGIN_S: Final = 0.01  # a tick
-SHRINKS: Final = 0.02  # seconds a second
-LONGEST_S: Final = 0.6  # a longer delay is an outage: it is reported, not waited for
+MARGIN_S: Final = 0.01  # one tick
+SHRINKS: Final = 0.02  # decrease of the shift, seconds per second
+LONGEST_S: Final = 0.6  # a longer delay is an outage, which does not change the shift
 
 
 @dataclass(frozen=True)
 class ClockSample:
-    """One exchange, complete at `at_s` of our clock; seconds."""
+    """One exchange of messages, complete at `at_s` of our clock; all values in seconds."""
 
     at_s: float
     offset_s: float
@@ -55,7 +55,7 @@ class ClockSample:
 
 
 class ClockOffset:
-    """The samples of the last `WINDOW_S`."""
+    """The clock samples of the last `WINDOW_S`."""
 
     def __init__(self) -> None:
         self._samples = deque[ClockSample]()
@@ -76,21 +76,21 @@ class ClockOffset:
         return min(self._samples, key=lambda sample: sample.delay_s, default=None)
 
     def theirs(self, our_s: float) -> float | None:
-        """Return a time of our clock by the server's; None while nothing is known of it."""
+        """Return the time on the server's clock at a time of ours; None before the first sample."""
         best = self.best
         return None if best is None else our_s + best.offset_s
 
 
 class JitterBuffer:
-    """The plans of one stream; time is loop time.
+    """A buffer that orders and delays the plans of one stream; all times are loop time.
 
     Args:
         horizon: frames of a plan.
         hop: frames from one plan to the next.
 
     Attributes:
-        shift_s: what is added to the times of plans at this moment.
-        lost, late, doubled: plans that never came, came after a newer one was played, or came twice.
+        shift_s: time that is currently added to the times of plans.
+        lost, late, doubled: counts of plans that never came, came after a newer one was played, or came twice.
     """
 
     def __init__(self, horizon: int, hop: int) -> None:
@@ -98,14 +98,14 @@ class JitterBuffer:
         self._hop = hop
         self._delays_s = deque[float](maxlen=DELAYS)
         self._waiting: dict[int, Plan] = {}  # by number
-        self._given: int | None = None  # number of the newest plan given
-        self._from_s = -math.inf  # plans made before it were delayed by an outage
+        self._given: int | None = None  # number of the newest plan returned
+        self._from_s = -math.inf  # plans made before this time were delayed by an outage
         self.shift_s = self._wanted_s = 0.0
-        self._shifted_s: float | None = None  # when
+        self._shifted_s: float | None = None  # time of the last update of the shift
         self.lost = self.late = self.doubled = 0
 
     def put(self, number: int, plan: Plan, came_s: float) -> None:
-        """Add a plan, made for frame `number`, which came at `came_s`."""
+        """Add a plan for frame `number` that came at `came_s`."""
         if self._given is not None and number <= self._given:
             self.late += number != self._given
             self.doubled += number == self._given
@@ -117,13 +117,13 @@ class JitterBuffer:
         self._waiting[number] = plan
 
     def take(self, now_s: float) -> Sequence[Plan]:
-        """Return plans whose turn it is, oldest first, with their times shifted."""
+        """Return plans that are due, oldest first, with their times shifted."""
         self._follow(now_s)
         taken = []
         while self._waiting:
             number = min(self._waiting)
             in_turn = self._given is None or number <= self._given + self._hop
-            # Out of turn once waiting longer for the one before is of no use.
+            # A plan is returned out of turn once it is too late to wait for the one before.
             if not in_turn and now_s + MARGIN_S < self._waiting[number].times_s[0] + self.shift_s:
                 break
             if self._given is not None:
@@ -137,9 +137,9 @@ class JitterBuffer:
         return taken
 
     def restart(self, now_s: float) -> None:
-        """Drop what waits, after an outage or for another stream.
+        """Drop waiting plans, after an outage or for another stream.
 
-        Measured delays are kept, and plans for frames from before `now_s` add none.
+        Measured delays are kept; plans made before `now_s` add none.
         """
         self._waiting.clear()
         self._given, self._from_s = None, now_s

@@ -1,12 +1,12 @@
-"""The motion spaces that listener papers work in: their table, the way from them to ours, and back.
+"""Motion spaces of listener papers: a table of them, and conversions from them to ours and back.
 
 `faceverse58`: 52 expression | 3 rotation, Euler x, y, z with R = Rz Ry Rx | 3 translation. Its neutral is about
-(pi, 0, 0), so every rotation is taken against the neutral one.
-`deca56`: 50 FLAME expression | 3 head axis-angle | 3 jaw axis-angle. FLAME's expression is not ARKit's: it takes a
-matrix that maps one to the other, which no licence lets us ship. Without it pose and jaw move and nothing else.
+(pi, 0, 0), so every rotation is relative to the neutral one.
+`deca56`: 50 FLAME expression | 3 head axis-angle | 3 jaw axis-angle. FLAME's expression is not ARKit's: a matrix has to
+map one to the other, and no licence lets us ship one. Without it only pose and jaw move.
 `arkit58`: our own motion.
 
-A rotation R of a space turns our head by A R A^T, where A takes the space's axes to ours (x forward, y left, z up).
+A rotation R of a space turns our head by A R A^T, where A maps the space's axes to ours (x forward, y left, z up).
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ class Space:
     """One motion space; rotations in radians, translation without a metric scale.
 
     Attributes:
-        expression, rotation: places of their numbers in a frame; `translation` and `jaw` where there are any.
+        expression, rotation: places of their numbers in a frame; also `translation` and `jaw`, if the space has them.
         euler: the rotation is three angles about the fixed axes x, y, z; otherwise it is axis-angle.
         axes: A (3, 3), rows are our x, y, z in the space's axes.
-        neutral: rotation of a face that looks straight ahead, as the space writes it.
+        neutral: rotation of a face that looks straight ahead, in the space's notation.
     """
 
     expression: slice
@@ -57,13 +57,13 @@ class Space:
     neutral: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def matrices(self, rotations: Doubles) -> Doubles:
-        """Return matrices (N, 3, 3) of rotations (N, 3) as the space writes them."""
+        """Return matrices (N, 3, 3) of rotations (N, 3) in the space's notation."""
         return rotation(rotations) if self.euler else from_vector(rotations)
 
 
-# The axes of both are unproved and may have to be flipped.
+# The axes of both spaces are not verified and may have to be flipped.
 # FaceVerse: camera frame x to the viewer's right, y down, z away from the viewer (LizhenWangT/FaceVerse @ a012b634:
-# row vectors times R transposed; that the neutral is Rx(pi) follows). FLAME: x to the head's left, y up, z forward.
+# row vectors times R transposed; so the neutral is Rx(pi)). FLAME: x to the head's left, y up, z forward.
 SPACES: Final[Mapping[str, Space]] = {
     "faceverse58": Space(
         expression=slice(0, 52),
@@ -81,12 +81,12 @@ SPACES: Final[Mapping[str, Space]] = {
 
 @dataclass(frozen=True)
 class MotionSpace:
-    """A space by its name, with what a listener's configuration says of it.
+    """A space by its name, with the settings of a listener's configuration.
 
     Attributes:
         neutral: (D,) the person's face at rest in the space.
-        metres_per_unit: scale of the space's translation; without one the head stays in its place.
-        flame: of `deca56`, from FLAME's expression to ours.
+        metres_per_unit: scale of the space's translation; without it the head stays in its place.
+        flame: for `deca56`, the matrix from FLAME's expression to ours.
     """
 
     name: str
@@ -98,7 +98,7 @@ class MotionSpace:
     def of(cls, settings: config.ListenerSettings, folder: Path | None = None) -> MotionSpace:
         """Return the space of a listener; a matrix is read from its `folder`, if given: only showing motion needs it.
 
-        Raises ConfigError when the matrix file is missing or unreadable.
+        Raises ConfigError if the matrix file is missing or unreadable.
         """
         matrix = None
         if settings.flame_matrix is not None and folder is not None:
@@ -130,8 +130,9 @@ class MotionSpace:
     def decode(self, frames: Floats | Doubles) -> tuple[Floats, Floats | None]:
         """Return our motion (N, 58) of frames (N, D), and the jaw (N, 3) [rad] where the space has one.
 
-        The jaw is axis-angle in our axes, + about y lowers the chin. Blendshapes are clipped to 0..1; `limitation` says
-        what cannot be shown. Raises ValueError for frames of another space that are not (N, D) and finite.
+        The jaw is axis-angle in our axes, + about y lowers the chin. Blendshapes are clipped to 0..1; `limitation`
+        describes what cannot be shown. Raises ValueError for frames of a space other than arkit58 that are not (N, D)
+        and finite.
         """
         if self.name == "arkit58":
             shown = np.array(frames, dtype=np.float32)
@@ -150,7 +151,7 @@ class MotionSpace:
             motion[:, POSE][:, 3:] = self.metres_per_unit * moved @ axes.T
 
         expression = values[:, known.expression]
-        if known.jaw is None:  # FaceVerse's is ARKit's, in our order
+        if known.jaw is None:  # FaceVerse's expression is ARKit's, in our order
             motion[:, SHAPES] = np.minimum(np.maximum(expression, 0.0), 1.0)
             return motion.astype(np.float32), None
         jaw_rad = values[:, known.jaw] @ axes.T
@@ -168,8 +169,8 @@ class MotionSpace:
     def encode(self, motion: Floats) -> Floats:
         """Return our motion (N, 58) in the space (N, D).
 
-        Without `metres_per_unit` the translation stays at rest. deca56 takes pose and jaw, its expression stays at
-        rest: ours cannot be written in it.
+        Without `metres_per_unit` the translation stays at rest. In deca56 pose and jaw are written; its expression
+        stays at rest, because ours cannot be written in it.
         """
         if motion.shape[-1] != MOTION_DIM:
             raise ValueError(f"motion is {motion.shape}, not (N, {MOTION_DIM})")
@@ -208,11 +209,11 @@ def rest_of(space: str) -> Doubles:
 #
 # The matrix has one row of FLAME coefficients per blendshape: weights @ matrix = coefficients. Such matrices are badly
 # conditioned (rows of rare shapes are huge), so it is not inverted: the result is the nearest weights within 0..1, with
-# a small price on their size and on left and right being different. Gaze is not in FLAME's expression: its channels
+# a small penalty on their size and on differences of left and right. Gaze is not in FLAME's expression: its channels
 # stay 0. The rows of the jaw are not used, because the jaw has a pose.
 
-COEFFICIENTS: Final = 50  # the first ones, those that deca56 has
-_SIZE_PRICE: Final = 0.02  # of the matrix's own scale
+COEFFICIENTS: Final = 50  # number of coefficients of deca56, the first ones of FLAME
+_SIZE_PRICE: Final = 0.02  # relative to the scale of the matrix
 _SIDES_PRICE: Final = 0.05
 _JAW: Final = BLENDSHAPES.index("jawOpen")
 _FIXED_AT_0: Final = [i for i, name in enumerate(BLENDSHAPES) if name.startswith("eyeLook")]
@@ -252,12 +253,12 @@ def bounded_least_squares(matrix: Doubles, wanted: Doubles, low: Doubles, high: 
 
 @dataclass(frozen=True)
 class FlameMatrix:
-    """`rows` (52, 50): FLAME coefficients of every blendshape at 1, in the order of `frames.BLENDSHAPES`."""
+    """FLAME coefficients of blendshapes: `rows` (52, 50), each blendshape at 1, ordered as `frames.BLENDSHAPES`."""
 
     rows: Doubles
 
     def solve(self, expression: Doubles, jaw_open: Doubles) -> Doubles:
-        """Return blendshapes (N, 52), 0..1, for coefficients (N, 50); jaw_open (N,), 0..1, is taken unchanged."""
+        """Return blendshapes (N, 52), 0..1, for coefficients (N, 50); jaw_open (N,), 0..1, is kept unchanged."""
         scale = float(np.sqrt((self.rows**2).sum(axis=1).mean()))
         each, (left, right) = np.eye(len(BLENDSHAPES)), np.transpose(_SIDES)
         prices = np.concatenate([_SIZE_PRICE * each, _SIDES_PRICE * (each[left] - each[right])]) * scale

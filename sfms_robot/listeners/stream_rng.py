@@ -1,4 +1,4 @@
-"""Random numbers of a stream: functions of its seed, the frame, the use and nothing else.
+"""Random numbers of a stream, as functions of only its seed, the frame and the use.
 
 They come from Philox, a counter-based generator. So it does not matter when a frame is drawn, how often, or together
 with which other streams: a plan that is made again draws the same numbers for the same frames.
@@ -21,7 +21,7 @@ class Use(IntEnum):
     """Purposes of the numbers: each has its own sequence."""
 
     EVENT = 0  # which kinds of events happen
-    COURSE = 1  # how an event goes; `part` is its kind
+    COURSE = 1  # duration, size and direction of an event; `part` is its kind
     HABIT = 2  # constants of a stream
     TOKENS = 16
     SWAY = 17
@@ -30,7 +30,7 @@ class Use(IntEnum):
 
 
 class _Generators(threading.local):
-    """One generator per thread, set to a new counter for every use: making a new one takes five times as long."""
+    """One generator per thread, set to a new counter for every use: creating one takes five times as long."""
 
     def __init__(self) -> None:
         self._philox = np.random.Philox(key=0)
@@ -38,8 +38,8 @@ class _Generators(threading.local):
         self._state: Any = self._philox.state
 
     def at(self, seed: int, frame: int, use: int, part: int = 0) -> np.random.Generator:
-        """Return the generator of one use in one frame; `part` of that use is any number."""
-        # Philox4x64: key = seed, counter = (0, frame, use, part). Each step of the lowest word of the counter gives
+        """Return the generator of one use in one frame; `part`, any number, is a separate sequence of that use."""
+        # Philox4x64: key = seed, counter = (0, frame, use, part). Each step of the lowest word of the counter yields
         # four numbers, so no two uses share any.
         counter = self._state["state"]["counter"]
         counter[0], counter[1], counter[2], counter[3] = 0, frame % 2**64, use, part

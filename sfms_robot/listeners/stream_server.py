@@ -1,15 +1,15 @@
-"""Many heads, one model: streams join, send frames, and are stepped in batches. Opens nothing, waits for nothing.
+"""Many heads, one model: streams join, send frames, and are stepped in batches. Opens no socket and never waits.
 
-Its owner (`app.serve`) brings messages and the time, and calls three methods in turn:
+Its owner (`app.serve`) passes messages and the time, and calls three methods in turn:
 
-    batch    the frames that are due, earliest deadline first, one of each stream, as many as can be made in time
+    batch    the frames that are due, earliest deadline first, one of each stream, as many as can be computed in time
     step     the listener steps them together
     finish   memories are kept, plans become messages
 
-A frame's deadline is `DEADLINE_S` after it was whole at its robot (as far as the clocks are known, else after it came);
-a frame that needs no plan may wait until the one that does. So a stream that is slow, or sends nothing, or sends what
-it missed in one burst, costs the others nothing: it has one place in a batch, like all of them. The memory of a stream
-is the listener's, and at most `MOST_WAITING` frames; where more are waiting it continues with the newest.
+A frame's deadline is `DEADLINE_S` after it was whole at its robot, or after it came if the clocks are not known. A
+frame that needs no plan may wait until the next frame that does. So a stream that is slow, sends nothing, or sends
+missed frames in one burst does not delay the others: it has one place in a batch, like all of them. A stream keeps the
+listener's memory and at most `MOST_WAITING` frames; if more are waiting, it continues with the newest.
 
 A frame that was lost on the way is replaced by an empty one (no sound, no face), so that memories count time.
 """
@@ -50,11 +50,11 @@ from sfms_robot.ports import Facts, Listener
 
 DEADLINE_S: Final = 0.080
 SILENT_S: Final = 10.0  # a stream that sends nothing for so long is dropped
-RECENT: Final = 2048  # delays and batches that p50 and p99 are of
-MOST_FILLED: Final = MOST_WAITING  # lost frames in a row that become empty ones; more is an outage
-SENT_AGAIN: Final = 2  # plans that repeat an event
-_STALE_S: Final = 2.0  # a frame that claims to be older has a clock of its own
-_SCALE_STEP: Final = 0.05  # of a batch's weight in the scale of costs
+RECENT: Final = 2048  # number of the last delays and batches in p50 and p99
+MOST_FILLED: Final = MOST_WAITING  # most lost frames in a row that become empty ones; more are an outage
+SENT_AGAIN: Final = 2  # number of plans that repeat an event
+_STALE_S: Final = 2.0  # a frame that seems older than this has a wrong clock: its arrival counts
+_SCALE_STEP: Final = 0.05  # weight of one batch in the scale of costs
 
 log = logging.getLogger(__name__)
 
@@ -64,15 +64,15 @@ _COUNTS: Final = tuple("heads plans deadline_misses batches steps skipped_frames
 
 @dataclass(frozen=True, kw_only=True)
 class Figures:
-    """Figures of one `StreamServer`; those of several that serve one listener add up.
+    """Figures of one `StreamServer`; `report` adds up those of several servers of one listener.
 
     Attributes:
         server, listener: names.
         hop: frames between plans.
-        counts: by the names of `_COUNTS`: `heads` at this moment, the others so far.
-        most_heads: number of heads that could be answered in time; None where all are admitted.
-        delays_s, batch_sizes: of the last plans, and of the last batches.
-        cost_scale: by how much batches take longer than measured at the start; None where that was not measured.
+        counts: counts by the names of `_COUNTS`: `heads` at this moment, the others since the start.
+        most_heads: number of heads that could be answered in time; None if all are admitted.
+        delays_s, batch_sizes: delays of the last plans, and sizes of the last batches.
+        cost_scale: duration of batches relative to the measurement at the start; None if there was none.
         cpu_s: processor time of its process.
     """
 
@@ -88,7 +88,7 @@ class Figures:
 
 
 def report(parts: Sequence[Figures]) -> Facts:
-    """Return the statistics of `serve`; `parts` are the processes of one server, one at least."""
+    """Return the statistics of `serve`; `parts` are the figures of all processes of one server, one at least."""
     first = parts[0]
     scales = [each.cost_scale for each in parts if each.cost_scale is not None]
     return {
@@ -132,7 +132,7 @@ class _Stream:
     heard_s: float
     waiting: deque[_Due] = field(default_factory=deque)
     expected: int | None = None  # number of the next frame
-    to_plan: int = 0  # steps until the next one that plans
+    to_plan: int = 0  # steps until the next step that plans
     stepping: bool = False
     events: deque[Events] = field(default_factory=lambda: deque(maxlen=SENT_AGAIN))
     calmness: Calmness | None = None
@@ -145,12 +145,12 @@ class StreamServer:
     """The streams of a listener's heads. Not thread-safe. All times are seconds of one clock.
 
     Args:
-        listener: the one that is served, under `name`.
+        listener: the listener that is served as `name`.
         capacity: costs of its batches; None admits all heads.
-        server: name of this server; a fresh number is put behind it.
+        server: name of this server; a random number is appended to it.
 
     Attributes:
-        counts: so far, see `Figures`.
+        counts: counts since the start, see `Figures`.
     """
 
     def __init__(self, listener: Listener, name: str, capacity: Capacity | None = None, server: str = "server") -> None:
@@ -216,7 +216,7 @@ class StreamServer:
         )
 
     def _full(self) -> str | None:
-        """Return why no more heads are admitted; None: one more is."""
+        """Return the reason why no further head is admitted; None if one more is."""
         if self._capacity is None:
             return None
         delay_s = self._capacity.delay_s(self.heads + 1, DEADLINE_S)
@@ -238,7 +238,7 @@ class StreamServer:
     # --- frames ------------------------------------------------------------------------------------------------------
 
     def receive(self, name: str, message: bytes, now_s: float) -> Sequence[bytes]:
-        """Take a message to the stream `name`; return what is to be answered at once. Never raises."""
+        """Process a message to the stream `name`; return the messages that answer it at once. Never raises."""
         stream = self._streams.get(name)
         if stream is None:
             return [words_message(Notice("unknown"))]
@@ -265,7 +265,7 @@ class StreamServer:
     def _enqueue(self, stream: _Stream, sent: SentFrame, now_s: float) -> Sequence[bytes]:
         gap = 0 if stream.expected is None else sent.number - stream.expected
         if gap < 0:
-            return []  # it came late, and an empty one has taken its place; or twice
+            return []  # the frame came late, and an empty one has replaced it; or it came twice
         self.counts["lost_frames"] += gap
         stream.expected = sent.number + 1
         made_s = sent.server_sent_s if 0.0 <= now_s - sent.server_sent_s <= _STALE_S else now_s
@@ -284,8 +284,8 @@ class StreamServer:
     # --- batches -----------------------------------------------------------------------------------------------------
 
     def batch(self) -> Batch | None:
-        """Return what is to be stepped next, or None. Its streams are in no other batch until `finish`."""
-        # A frame that needs no plan may wait until the one that does.
+        """Return the next batch to be stepped, or None. Its streams are in no other batch until `finish`."""
+        # A frame that needs no plan may wait until the next frame that does.
         due = sorted(self._ready(), key=lambda each: each.waiting[0].deadline_s + each.to_plan * FRAME_S)[: self._most]
         for stream in due:
             stream.stepping = True
@@ -302,7 +302,7 @@ class StreamServer:
     def finish(
         self, batch: Batch, answers: Sequence[tuple[Plan | None, Any]], began_s: float, now_s: float
     ) -> list[tuple[str, bytes]]:
-        """Keep the memories; return the messages to be sent, each with its stream. `began_s`: when the step did."""
+        """Keep the memories; return the messages to be sent, each with its stream. `began_s`: start of the step."""
         step_s = now_s - began_s
         messages = []
         for (stream, due), (plan, memory) in zip(batch, answers, strict=True):
@@ -329,7 +329,10 @@ class StreamServer:
         return messages
 
     def too_many(self, batch: Batch) -> None:
-        """Let a batch wait that the memory did not hold, and take half as many from now on; one alone joins again."""
+        """Requeue a batch that did not fit in memory, and halve batches from now on; drop a stream that was alone.
+
+        The dropped stream joins again.
+        """
         self._most = max(1, len(batch) // 2)
         if len(batch) == 1:
             self.failed(batch)
@@ -343,7 +346,7 @@ class StreamServer:
             self._streams.pop(stream.name, None)
 
     def _weigh(self, plans: int, steps: int, step_s: float) -> None:
-        """Adapt the scale of the costs to how long this batch took."""
+        """Adapt the scale of the costs to the duration of this batch."""
         if self._capacity is None:
             return
         scale = self._capacity.scale
@@ -353,7 +356,7 @@ class StreamServer:
             self._capacity = replace(self._capacity, scale=scale + _SCALE_STEP * (ratio - scale))
 
     def _batch_limit(self) -> int:
-        """Return the number of streams of a batch that takes half of the deadline, all planning."""
+        """Return the largest number of streams that can all plan in a batch within half of the deadline."""
         if self._capacity is None:
             return 1 << 16
         return next((size for size in range(1, 4096) if self._capacity.batch_s(size + 1, 0) > DEADLINE_S / 2), 4096)
@@ -361,7 +364,7 @@ class StreamServer:
     # --- figures -----------------------------------------------------------------------------------------------------
 
     def figures(self) -> Figures:
-        """Return what it has done so far."""
+        """Return the figures of this server so far."""
         capacity = self._capacity
         return Figures(
             server=self._server,

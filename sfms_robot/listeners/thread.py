@@ -1,7 +1,7 @@
-"""A listener object in a thread of this process (ports.PlanFeed), and what it shares with one in a child process.
+"""A listener object in a thread of this process (ports.PlanFeed), and parts shared with one in a child process.
 
-For a listener that cannot be loaded by name in a child process. It shares the interpreter with the servo loop: a
-step that computes for long without releasing Python's lock makes ticks late. Listeners by name do not: `process`.
+The thread is for a listener that cannot be loaded by name. It shares the interpreter with the servo loop: a step that
+computes for long without releasing Python's lock makes ticks late. Listeners loaded by name run in `process` instead.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from sfms_robot.signals.quantiles import Quantiles
 CLOSE_LIMIT_S: Final = 0.2
 HUNG_S: Final = LIMITS["listener"].hung_s
 LATE_S: Final = 1.0
-USUAL_S: Final = 0.1  # from the end of a frame until a microphone's sound is there
+USUAL_S: Final = 0.1  # usual delay of a microphone's sound after the end of a frame
 MOST_WAITING: Final = FRAME_HZ // 2  # frames
-CATCH_UP: Final = 0.5  # frames by which fewer must wait after each, while it catches up: twice the person's pace
+CATCH_UP: Final = 0.5  # least decrease of waiting frames per step while catching up: twice the person's pace
 
 Say = Callable[[tuple[str, Any]], object]
 
@@ -32,21 +32,21 @@ log = logging.getLogger(__name__)
 
 
 class Inbox:
-    """Frames in the order in which they came, until None does.
+    """A queue of frames in order of arrival; None ends it.
 
-    A machine that cannot keep up must not answer what was said seconds ago: when more than `MOST_WAITING` frames wait,
+    A machine that cannot keep up must not answer words from seconds ago: when more than `MOST_WAITING` frames wait,
     the listener continues with the newest, and the others are counted. Frames that came before the first call of `next`
-    do not count as too many, as long as they become fewer at the pace of `CATCH_UP`.
+    do not count as too many, as long as their number falls at the pace of `CATCH_UP`.
 
     Attributes:
-        skipped: frames left out before the last one returned.
-        calmness: requested since the last frame; None: none.
-        hop: requested; None: the listener's own.
+        skipped: number of frames left out before the last one returned.
+        calmness: rates requested since the last frame; None if there are none.
+        hop: requested hop; None: the listener's own.
     """
 
     def __init__(self) -> None:
         self._queue = queue.SimpleQueue[SpeakerFrame | None]()
-        self._allowed: float | None = None  # to wait, while it catches up with those of before
+        self._allowed: float | None = None  # frames that may wait while it catches up with earlier ones
         self._waiting = deque[SpeakerFrame | None]()
         self.skipped = 0
         self.calmness: Calmness | None = None
@@ -57,7 +57,7 @@ class Inbox:
         self._queue.put(frame)
 
     def next(self) -> SpeakerFrame | None:
-        """Return the next frame; blocks until there is one. None, the end, comes before all that waits."""
+        """Return the next frame; blocks until there is one. None, the end, is returned before all waiting frames."""
         while not self._waiting or not self._queue.empty():
             self._waiting.append(self._queue.get())
         if None in self._waiting:
@@ -71,13 +71,13 @@ class Inbox:
 
 
 def calmed(listener: Listener, memory: Any, calmness: Calmness | None) -> Any:
-    """Return the memory with the rates that were requested since the last frame, if the listener has any."""
+    """Return the memory with the rates that were requested since the last frame, if the listener has rates."""
     change = getattr(listener, "calmed", None)
     return memory if calmness is None or change is None else change(memory, calmness)
 
 
 class Stepped(NamedTuple):
-    """The answer to a frame: a plan where one is due, what it took, and the number of frames left out before it."""
+    """The answer to a frame: a plan if one is due, the duration of the step, and the number of frames left out."""
 
     plan: Plan | None
     taken_ms: float
@@ -85,7 +85,7 @@ class Stepped(NamedTuple):
 
 
 def listen(listener: Listener, seed: int, inbox: Inbox, say: Say) -> None:
-    """Step once per frame until None comes; report readiness, and each `Stepped`."""
+    """Step once per frame until None comes; pass "ready" and each `Stepped` to `say`."""
     from sfms_robot.listeners.registry import at_hop
 
     memory = listener.start(seed)
@@ -101,18 +101,18 @@ def listen(listener: Listener, seed: int, inbox: Inbox, say: Say) -> None:
 
 
 class Lateness:
-    """A judge of plans: in time to be shown, or not. A listener on a slow computer answers, but always too late.
+    """A check whether plans come in time to be shown. A listener on a slow computer answers, but always too late.
 
-    A plan that would be in time, had its frame come as soon as that of a microphone, is late by its source.
+    If a plan would be in time with a frame that came as soon as a microphone's, its source is late, not the listener.
 
     Attributes:
-        lasting: for `LATE_S` every plan has come after the time of its last frame. The first one in time ends it.
+        lasting: for `LATE_S` every plan has come after the time of its last frame. The next plan in time ends it.
     """
 
     def __init__(self) -> None:
         self.lasting = False
-        self._since_s: float | None = None  # of the first late one in a row
-        self._given = deque[tuple[float, float]](maxlen=2 * FRAME_HZ)  # time of a frame, and how late it came
+        self._since_s: float | None = None  # time of the first late plan in a row
+        self._given = deque[tuple[float, float]](maxlen=2 * FRAME_HZ)  # time of a frame, and its delay
         self._source_said = False
 
     def named(self, state: str) -> str:
@@ -120,11 +120,11 @@ class Lateness:
         return "late" if self.lasting and state == "listening" else state
 
     def gave(self, frame: SpeakerFrame, now_s: float) -> None:
-        """Note when the listener was given a frame."""
+        """Record the time at which the listener received a frame."""
         self._given.append((frame.time_s, now_s - frame.time_s))
 
     def came(self, plan: Plan, now_s: float) -> None:
-        """Judge a plan that arrived at `now_s`, by the clock of its frames."""
+        """Check a plan that arrived at `now_s`, a time of the same clock as its frames."""
         given_s = next((late_s for time_s, late_s in reversed(self._given) if time_s <= plan.made_at_s + 1e-6), 0.0)
         by_source_s = max(0.0, given_s - USUAL_S)
         if now_s <= plan.times_s[-1] + by_source_s:
@@ -143,7 +143,7 @@ class Lateness:
 
 
 class ListenerThread:
-    """Frames in, plans out, as `ListenerProcess`; an exception ends the listening, not the run."""
+    """A listener in a thread, used as a `ListenerProcess`; an exception ends the listening, not the run."""
 
     def __init__(self, listener: Listener, seed: int) -> None:
         self._listener, self._seed = listener, seed
@@ -152,7 +152,7 @@ class ListenerThread:
         self._step_ms = Quantiles()
         self._lateness = Lateness()
         self._unanswered = self._skipped = 0  # frames
-        self._since_s = 0.0  # nothing was waiting, or an answer came
+        self._since_s = 0.0  # last time at which no frame was waiting or an answer came
         self._state = "listening"
         self._thread = start_thread(self._work, "listener")
 
@@ -172,7 +172,7 @@ class ListenerThread:
         self._inbox.calmness = calmness
 
     def poll(self, now_s: float) -> Sequence[Plan]:
-        """Return plans that came. Never blocks."""
+        """Return plans that have arrived. Never blocks."""
         plans = []
         while not self._said.empty():
             kind, value = self._said.get_nowait()
@@ -201,11 +201,11 @@ class ListenerThread:
 
     @property
     def lost(self) -> bool:
-        """Return whether it hangs, has failed, or is always too late."""
+        """Return whether the listener hangs, has failed, or is always too late."""
         return self._state != "listening" or self._lateness.lasting
 
     def statistics(self) -> Facts:
-        """Return `state` (listening, late, hung, or "failed: " and why), `restarts` 0, `skipped_frames`, `step_ms`."""
+        """Return `state` (listening, late, hung, "failed: " and reason), `restarts` 0, `skipped_frames`, `step_ms`."""
         return {
             "state": self._lateness.named(self._state),
             "restarts": 0,
@@ -214,7 +214,7 @@ class ListenerThread:
         }
 
     def close(self) -> None:
-        """End after the step at hand; blocks for `CLOSE_LIMIT_S` at most, a step that hangs is left behind."""
+        """End after the current step; blocks for `CLOSE_LIMIT_S` at most and abandons a step that hangs."""
         self._inbox.put(None)
         self._thread.join(CLOSE_LIMIT_S)
 

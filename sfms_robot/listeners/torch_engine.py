@@ -1,9 +1,9 @@
-"""Networks on torch: run as modules, as graphs of a GPU, or written as ONNX graphs without weights.
+"""Networks on torch: run as modules, as CUDA graphs, or written as ONNX graphs without weights.
 
 `TorchEngine` runs a listener's networks, `BatchEngine` those of many streams together on a GPU. `export` writes them
 for `engine.OnnxEngine`: torch.export traces a network for any number of streams, torch.onnx writes it, onnxscript
-simplifies it. Weights keep the names that they have in model.safetensors and none of their values goes into a graph: so
-graphs are small, and all weights trained for the same configuration run on them. `export` needs the extra `export`.
+simplifies it. Weights keep their names from model.safetensors, and graphs contain none of their values. So graphs are
+small, and work with all weights trained for the same configuration. `export` needs the extra `export`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from sfms_robot.listeners.sfms.stream import SfmsListener
 
 Networks = Mapping[str, Network[Any]]  # by name
 
-MODEL: Final = "model."  # before the name of a weight, in every network
+MODEL: Final = "model."  # prefix of the name of a weight, in every network
 MOST_STREAMS: Final = 4096
 EXAMPLE_STREAMS: Final = 3
 ONE_STREAM: Final = "rest"  # the network that is called once, for one stream, when a listener is loaded
@@ -49,8 +49,8 @@ class TorchEngine:
     """An `engine.Engine` on torch.
 
     Args:
-        model: `tensors` shows its current state.
-        networks: of the model.
+        model: model of the listener; `tensors` shows its current state.
+        networks: networks of the model.
     """
 
     def __init__(self, model: nn.Module, networks: Networks) -> None:
@@ -72,11 +72,11 @@ class TorchEngine:
 class BatchEngine(TorchEngine):
     """An engine for many streams: each network is computed for a whole batch at once, on a GPU as one CUDA graph.
 
-    A batch is filled up to the next power of two with rows that are computed and left out, so that few graphs serve all
-    numbers of streams. A graph is captured when its size is first needed. Nothing in a network makes a tensor on the
-    CPU or looks at a value (a law of the tests): that cannot be captured.
+    A batch is padded to the next power of two with rows that are computed and dropped, so that few graphs serve all
+    numbers of streams. A graph is captured when its size is first needed. No network makes a tensor on the CPU or reads
+    a value (a law of the tests), because that cannot be captured.
 
-    Raises MemoryError, from `run` too, where the GPU has too little memory: no stream has moved then.
+    Raises MemoryError, from `run` too, if the GPU has too little memory; no stream has advanced then.
     """
 
     def __init__(self, model: nn.Module, networks: Networks, device: torch.device) -> None:
@@ -113,9 +113,9 @@ class BatchEngine(TorchEngine):
 
 
 class _NetworkBatch:
-    """Inputs of a network for `size` streams, which stay in place, and the graph that makes its outputs from them.
+    """Input buffers of a network for `size` streams, and the CUDA graph that computes its outputs from them.
 
-    `pool`: memory of the graph; None: without one.
+    `pool`: memory of the graph; None: without a graph.
     """
 
     def __init__(self, network: nn.Module, like: Sequence[Tensor], size: int, device: torch.device, pool: Any) -> None:
@@ -126,7 +126,7 @@ class _NetworkBatch:
         # Waiting for a blocking event leaves the core to the other processes of `serve`; copying to the CPU would spin.
         self._done = torch.Event(device, blocking=True) if device.type == "cuda" else None
         if pool is not None:
-            for _ in range(2):  # what the network makes once, such as places, is made before
+            for _ in range(2):  # tensors that the network makes only once, such as places, are made before the capture
                 network(*self._inputs)
             self._graph = torch.cuda.CUDAGraph()
             with torch.cuda.graph(self._graph, pool=pool):
@@ -135,7 +135,7 @@ class _NetworkBatch:
     def run(self, inputs: Sequence[Tensor], streams: int) -> tuple[Array, ...]:
         """Return the outputs (streams, ...) of inputs (streams, ...) or (1, ...)."""
         for kept, each in zip(self._inputs, inputs, strict=True):
-            # Only from pinned memory is an input sent while the next one is prepared.
+            # An input is copied while the next one is prepared only if it is in pinned memory.
             kept[:streams].copy_(each.pin_memory() if kept.is_cuda else each, non_blocking=True)
         outputs = self._outputs
         if self._graph is None:
@@ -159,7 +159,7 @@ class RecordingEngine(TorchEngine):
         """Return the outputs of a network, see `engine.Engine.run`."""
         module, streams = self._networks[network], max(map(len, inputs))
         names: list[str] = [*signature(module.forward).parameters]
-        if module.further:  # in place of *parts
+        if module.further:  # these names replace *parts
             names[-1:] = module.further
         arrays = _tensors(np.broadcast_to(each, (streams, *each.shape[1:])) for each in inputs)
         self.examples[network] = dict(zip(names, arrays, strict=False))
@@ -187,7 +187,7 @@ def networks_of(model: SfmsModel | ArigModel) -> Networks:
 
 
 def torch_engine(model: SfmsModel | ArigModel, device: Device = "cpu") -> TorchEngine:
-    """Return an engine for a model in memory; on a GPU one that batches. Raises ConfigError without a GPU."""
+    """Return an engine for a model in memory; a `BatchEngine` for a GPU. Raises ConfigError without a GPU."""
     if device == "cpu":
         return TorchEngine(model, networks_of(model))
     if not torch.cuda.is_available():
@@ -196,19 +196,19 @@ def torch_engine(model: SfmsModel | ArigModel, device: Device = "cpu") -> TorchE
 
 
 def _tensors(arrays: Iterable[Array]) -> Tensors:
-    """Return arrays as tensors of the same memory; read-only ones, which torch does not know, are copied."""
+    """Return arrays as tensors of the same memory; read-only arrays, which torch does not support, are copied."""
     return tuple(torch.from_numpy(each if each.flags.writeable else each.copy()) for each in arrays)
 
 
 # --- Export -----------------------------------------------------------------------------------------------------------
 #
-# What is done to the graph of a network:
+# Steps from a network to its graph:
 #
 #     1. torch.export: a program in which the number of streams N is a symbol. Modules write attention and LayerNorm as
 #        the one operator that onnxruntime has for each (`layers.attention`).
 #     2. torch.onnx: initialisers hold the weights, "model.NAME", and constants.
-#     3. Weights become inputs, onnxscript folds constants and removes what is not used, weights become initialisers
-#        again. As initialisers they would be folded into the graph; values of inputs are not known.
+#     3. Weights become inputs, onnxscript folds constants and removes unused parts, weights become initialisers again.
+#        As initialisers they would be folded into the graph; inputs have no values.
 #     4. The file is written with initialisers that have a name, a shape and a type, but refer to model.safetensors for
 #        their content, which `engine` hands to the session (`_written`).
 
@@ -216,12 +216,12 @@ def _tensors(arrays: Iterable[Array]) -> Tensors:
 def export(
     folder: Path, out: Path, int8: bool = False, moved: Callable[[float, float, str], object] = lambda *_: None
 ) -> list[Path]:
-    """Write the graphs of a listener's folder below `out` and return the files. Takes half a minute to two.
+    """Write the graphs of a listener's folder below `out` and return the files. Takes half a minute to two minutes.
 
-    `moved`: is called before each graph with the number made, the number in all, and its name.
+    `moved`: is called before each graph with the number of graphs made, their total number, and the graph's name.
     `int8`: a second graph of each network has its large layers in 8 bits. SFMS, whose layers are small, has none.
 
-    Raises ConfigError, MissingExtra, and ModelError where `out` cannot be written.
+    Raises ConfigError, MissingExtra, and ModelError if `out` cannot be written.
     """
     settings = load_config(folder)
     with torch.random.fork_rng(devices=[]):
@@ -308,7 +308,7 @@ def _graph(network: Network[Any], example: Mapping[str, Tensor], several: bool) 
     if several:
         streams, free = (torch.export.Dim(name, min=1, max=MOST_STREAMS) for name in ("streams", "free"))
         dynamic = tuple({0: streams} | ({1: free} if name in network.free else {}) for name in example)
-        if network.further:  # in the form of the arguments of `forward`, where all of *parts are one
+        if network.further:  # in the form of the arguments of `forward`, where *parts is one argument
             named = len(dynamic) - len(network.further)
             dynamic = (*dynamic[:named], dynamic[named:])
     with warnings.catch_warnings():
@@ -326,7 +326,7 @@ def _graph(network: Network[Any], example: Mapping[str, Tensor], several: bool) 
     graph: Any = exported.model.graph
     held = [value for name, value in graph.initializers.items() if name.startswith(MODEL)]
     kept = {value.name: value.const_value for value in held}
-    for value in held:  # step 3: as inputs, whose values cannot be folded into the graph
+    for value in held:  # step 3: weights become inputs, which cannot be folded into the graph
         del graph.initializers[value.name]
         value.const_value = None
         graph.inputs.append(value)
@@ -346,14 +346,14 @@ def _written(model: Any, state: Mapping[str, Tensor]) -> tuple[bytes, dict[str, 
 
     proto = onnx_ir.to_proto(model)
     graph = proto.graph
-    # Nothing about the machine and the source files that made it.
+    # The file contains nothing about the machine and the source files that made it.
     for part in (proto, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
         part.ClearField("metadata_props")
         part.ClearField("doc_string")
     graph.ClearField("value_info")
     proto.producer_name, proto.producer_version = "sfms-robot", ""
     weights, layers = [], []
-    names: dict[str, str] = {}  # of initialisers, as they were and as they are written
+    names: dict[str, str] = {}  # old name of each initialiser -> written name
     for tensor in graph.initializer:
         name = tensor.name.removeprefix(MODEL)
         if name.removesuffix(".int8") in state and name.endswith(".int8"):

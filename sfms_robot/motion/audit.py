@@ -42,7 +42,7 @@ class CommandAudit:
         return AuditState(np.tile(angles_rad, (3, 1)), self._calibration.to_ticks(angles_rad))
 
     def restart(self, joints: Bools, angles_rad: Doubles, state: AuditState) -> AuditState:
-        """Return the state with some `joints` (J,) at rest at `angles_rad` (J,); their way there was not commanded."""
+        """Return the state with some `joints` (J,) at rest at `angles_rad` (J,); the way there was not commanded."""
         recent = np.where(joints, angles_rad, state.recent_rad)
         ticks = np.where(joints, self._calibration.to_ticks(angles_rad), state.ticks)
         return replace(state, recent_rad=recent, ticks=ticks)
@@ -50,8 +50,8 @@ class CommandAudit:
     def step(self, angles_rad: Doubles, wanted_rad: Doubles, state: AuditState) -> AuditState:
         """Count one command (J,) against the limits, and against `wanted_rad` (J,), the reference of the limiter.
 
-        A joint that breaks several limits in one tick counts once. One outside its own range may stay there and come
-        in, not go farther out (`sfms_robot.ranges`). An angle that is not finite is a violation, and not kept.
+        A joint that breaks several limits in one tick counts once. A joint outside its own range may stay there and
+        come in, but not go farther out (`sfms_robot.ranges`). An angle that is not finite is a violation, and not kept.
         """
         finite = np.isfinite(angles_rad)
         angles = np.where(finite, angles_rad, state.recent_rad[-1])

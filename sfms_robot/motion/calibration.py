@@ -13,7 +13,7 @@ from sfms_robot.config import Joint
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import Doubles, Ints, Reals
 
-_ROUNDING_TICKS = 1e-6  # a limit this close to a whole tick is that tick
+_ROUNDING_TICKS = 1e-6  # a limit this close to a whole tick counts as that tick
 
 
 class Calibration:
@@ -21,15 +21,15 @@ class Calibration:
 
     Args:
         joints: name -> joint, in the order of the angles.
-        ticks_per_revolution: (J,) of each joint's servo.
+        ticks_per_revolution: (J,) ticks of one turn of each joint's servo.
 
     Attributes:
         zero_ticks: (J,) at angle 0.
         ticks_per_rad: (J,) with sign.
         low_ticks, high_ticks: (J,) first and last tick inside the position limits.
 
-    Raises ConfigError when the range of a joint leaves the one turn a servo in position mode has. A geared joint
-    (`ratio` other than 1) may need several: its servo then works in extended position mode, where the model has one.
+    Raises ConfigError when the range of a joint exceeds the one turn of a servo in position mode. A geared joint
+    (`ratio` other than 1) may need several turns: its servo then works in extended position mode, if the model has it.
     """
 
     def __init__(self, joints: Mapping[str, Joint], ticks_per_revolution: Reals) -> None:

@@ -3,8 +3,8 @@
 A state is position, speed and acceleration of a joint, all along one axis. Plain floats: the limiter calls this for one
 joint at a time.
 
-`ruckig` (Berscheid and Kroeger, 2021) plans the fastest way, where it is installed. It has no wheel for Linux on ARM;
-`StopChase` is the fallback without it: always lawful, a little slower to arrive.
+`ruckig` (Berscheid and Kroeger, 2021) plans the fastest way, where it is installed. It has no wheel for Linux on ARM.
+`StopChase` is the fallback without it: its motion is always lawful, but arrives a little later.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from typing import Final, NamedTuple
 
 _HALVINGS: Final = 16
-# Rounding eats into a limit at about 1e-9 of it; the law is tested at 1e-6.
+# Rounding errors may exceed a limit by about 1e-9 of it; the law is tested at 1e-6.
 SLACK: Final = 1e-9
 POSITION_SLACK_RAD: Final = 1e-10
 _STANDS_RAD_S: Final = 1e-12
@@ -33,9 +33,9 @@ class Bound(NamedTuple):
 
 
 class Stop(NamedTuple):
-    """The fastest stop, everything along `s`, the sign of the speed once the acceleration is gone.
+    """The fastest stop, with all values along `s`, the sign of the speed once the acceleration is gone.
 
-    Jerk -J until the acceleration is -peak, which is held where it is the limit, then +J.
+    The jerk is -J until the acceleration is -peak, 0 while this is held if it is the limit, then +J.
     """
 
     s: float
@@ -48,13 +48,13 @@ class Stop(NamedTuple):
     def of(cls, speed: float, acceleration: float, bound: Bound) -> Stop:
         """Return the stop from any finite state."""
         most, jerk = bound.acceleration, bound.jerk
-        # Speed once the acceleration is gone, by jerk alone: v + a |a| / 2J. Its sign is the way of the stop.
+        # Speed once the acceleration is gone, by jerk alone: v + a |a| / 2J. Its sign is the direction of the stop.
         s = 1.0 if speed + acceleration * abs(acceleration) / (2 * jerk) >= 0 else -1.0
         v, a = s * speed, s * acceleration
-        # Without a held piece, -J until -peak and +J back to 0 take v = (peak^2 - a^2 / 2) / J off the speed.
+        # Without a held piece, -J until -peak and +J back to 0 reduce the speed by v = (peak^2 - a^2 / 2) / J.
         peak = min(math.sqrt(max(jerk * v + a * a / 2, 0.0)), most)
         t1 = max((a + peak) / jerk, 0.0)
-        # The held piece takes the rest of the speed at -most.
+        # The held piece removes the rest of the speed at -most.
         t2 = max(v + a * t1 - jerk * (t1 * t1) / 2 - peak * peak / (2 * jerk), 0.0) / most
         return cls(s, v, a, jerk, (t1, t2, peak / jerk))
 
@@ -66,18 +66,18 @@ class Stop(NamedTuple):
             left -= t
             state = _moved(state, jerk, t)
         p, v, a = state
-        if left > 0:  # at the end speed and acceleration are 0 but for rounding
+        if left > 0:  # at the end speed and acceleration are 0 except for rounding
             return self.s * p, 0.0, 0.0
         return self.s * p, self.s * v, self.s * a
 
     def extent(self) -> tuple[float, float]:
-        """Return the way below and above the position it starts from [rad].
+        """Return how far the stop goes below and above its start [rad].
 
-        Where the joint moves against s at first, it turns round on the way, while the acceleration still falls.
+        A joint that moves against s at first turns round on the way, while the acceleration still falls.
         """
         end, turn = self.after(math.inf)[0], 0.0
         if self.speed < 0:
-            # It turns round where v + a t - J t^2 / 2 = 0.
+            # The joint turns round where v + a t - J t^2 / 2 = 0.
             v, a, jerk = self.speed, self.acceleration, self.jerk
             t = (a - math.sqrt(max(a * a + 2 * jerk * v, 0.0))) / jerk
             turn = self.s * t * (v + t * (a / 2 - t * jerk / 6))
@@ -100,10 +100,10 @@ def lawful(state: State, low: float, high: float, bound: Bound) -> bool:
     lasts = size / bound.jerk  # time until the acceleration is gone
     peak = speed + 0.5 * acceleration * lasts  # speed by then
     fastest = bound.speed * (1 + SLACK)
-    if not (abs(speed) <= fastest and abs(peak) <= fastest and size <= most * (1 + SLACK)):  # neither for NaN
+    if not (abs(speed) <= fastest and abs(peak) <= fastest and size <= most * (1 + SLACK)):  # false for NaN
         return False
     top = abs(speed) + 0.5 * size * lasts
-    farthest = top * (lasts + most / bound.jerk + 0.5 * top / most)  # no stop from here takes more way than this
+    farthest = top * (lasts + most / bound.jerk + 0.5 * top / most)  # no stop from here goes farther
     if low + farthest <= position <= high - farthest:
         return True
     if not math.isfinite(position):
@@ -119,12 +119,12 @@ def moves_in(state: State, way: float, bound: Bound) -> bool:
 
 
 class TimeOptimalChase:
-    """Chase by the first tick of ruckig's fastest way."""
+    """Chase that uses the first tick of ruckig's fastest way."""
 
     def __init__(self, bounds: Sequence[Bound], dt_s: float) -> None:
         import ruckig
 
-        self._errors = (ruckig.RuckigError, ValueError)  # no way at the rim of the law, or one of hours (-101, unnamed)
+        self._errors = (ruckig.RuckigError, ValueError)  # no way at the law's edge, or one of hours (-101, no name)
         self._planner, self._path, self._dt_s = ruckig.Ruckig(1), ruckig.Trajectory(1), dt_s
         self._inputs = []
         for speed, acceleration, jerk in bounds:
@@ -148,10 +148,10 @@ class TimeOptimalChase:
 
 
 class StopChase(NamedTuple):
-    """Chase by the most jerk toward the target that still lets the joint stop where the target would stop.
+    """Chase that uses the most jerk toward the target with which the joint can still stop where the target would stop.
 
-    A state reached in one tick by a mixture of braking and full jerk is the same mixture of the two states, and the
-    more jerk, the farther on its stop ends: so the mixture is found by halving.
+    A mixture of braking and full jerk during a tick leads to the same mixture of the two end states. The larger the
+    share of full jerk, the farther away the stop ends, so the share is found by halving.
     """
 
     bounds: Sequence[Bound]
@@ -178,7 +178,7 @@ class StopChase(NamedTuple):
         return best
 
     def _ends(self, before: State, bound: Bound, s: float) -> tuple[State, State]:
-        """Return one tick of braking, and one of full jerk along `s` within the limit of acceleration."""
+        """Return the states after a tick of braking and of full jerk along `s`, within the limit of acceleration."""
         position, speed, acceleration = before
         way, *rates = Stop.of(speed, acceleration, bound).after(self.dt_s)
         rising = min(max((bound.acceleration - s * acceleration) / bound.jerk, 0.0), self.dt_s)

@@ -1,25 +1,25 @@
 """Position, speed, acceleration and jerk of every joint, never exceeded.
 
 The law: after every tick the state (position, speed, acceleration) of a joint can be brought to a stop inside its
-range, its speed and acceleration being within their limits all the way. A tick keeps it like this:
+range, its speed and acceleration being within their limits all the way. A tick keeps the law as follows:
 
 1. If one tick of bounded jerk leads exactly to the reference sample, and the law holds there, the sample passes
    unchanged: no lag, no chatter. Three equal pieces of constant jerk meet any position, speed and acceleration
    exactly, so the test is a 3x3 product for all joints at once.
-2. Otherwise the candidate is the first tick of a way to the reference (`motion.jerk_step`), if the law holds.
+2. Otherwise the joint makes the first tick of a way to the reference (`motion.jerk_step`), if the law holds there.
 3. Otherwise the joint brakes for one tick. The braking curve of a lawful state stays lawful, so by induction there
    is always a way out.
 
-Nearly always all joints pass, and bounds that are a little too strict but cost a few array operations for all of them
-show it. The joints that they do not settle are looked at one by one.
+Nearly always all joints pass. Bounds that are a little too strict show this at the cost of a few array operations for
+all joints. The joints that do not meet these bounds are checked one by one.
 
 A joint that is found outside its own range starts there, and the range in force (`sfms_robot.ranges`) reaches out to
-it. There the law also says that the stop of a joint never turns back: it moves in or stands still, and its braking
-curve inherits that. Where the reference does not bring it in, `Recovery` does, so that it is inside its own range
-after a bounded time for any reference (docs/safety.md), and stays.
+it. There the law also says that the stop of a joint never turns back: the joint moves in or stands still, and its
+braking curve inherits that. If the reference does not bring the joint in, `Recovery` does, so that it is inside its own
+range after a bounded time for any reference (docs/safety.md), and stays there.
 
-Finite differences of the positions sent are averages of the speed, acceleration and jerk between them, hence within
-the same limits. A reference that is not finite is refused: the joint brakes, and the tick is counted.
+Finite differences of the positions sent are averages of the speed, acceleration and jerk between them, and therefore
+within the same limits. A reference that is not finite is refused: the joint brakes, and the tick is counted.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from sfms_robot.motion.jerk_step import FASTEST, SLACK, Bound, Chase, State, Sto
 from sfms_robot.ranges import Range
 from sfms_robot.signals.minimum_jerk import minimum_jerk
 
-_HEADROOM: Final = 1 - 2e-7  # of a limit, for rounding; the law is tested at 1e-6
+_HEADROOM: Final = 1 - 2e-7  # share of a limit that is used, because of rounding; the law is tested at 1e-6
 _EDGE_SLACK_RAD: Final = 1e-12  # so that rounding does not make a joint at the end of its range a hard case
 
-GENTLE_S: Final = 2.0  # longer than the easing of a run, so that usually the requested face is ahead of the curve
+GENTLE_S: Final = 2.0  # shortest curve; longer than a run's easing, so that the requested face is usually ahead of it
 _SHARE: Final = 0.8
 # Highest speed, acceleration and jerk of 10 u^3 - 15 u^4 + 6 u^5 over u = 0..1.
 _PEAKS: Final = (15 / 8, 10 / 3**0.5, 60.0)
@@ -53,7 +53,7 @@ _JERKS_FOR = np.linalg.inv(np.array([[1 / 3, 1 / 3, 1 / 3], [5 / 18, 3 / 18, 1 /
 
 @dataclass(frozen=True)
 class JointLimits:
-    """All (J,): range [rad], speed [rad/s], acceleration [rad/s^2], jerk [rad/s^3]."""
+    """Limits of joints, (J,) each: range [rad], speed [rad/s], acceleration [rad/s^2], jerk [rad/s^3]."""
 
     low: Doubles
     high: Doubles
@@ -80,7 +80,7 @@ class JointLimits:
 
 
 def curve_s(distance_rad: Doubles, speed: Doubles, acceleration: Doubles, jerk: Doubles) -> Doubles:
-    """Return the duration [s] (J,) of the curves over `distance_rad` (J,), under limits (J,)."""
+    """Return the duration [s] (J,) of recovery curves over `distance_rad` (J,), under limits (J,)."""
     v, a, j = (peak * distance_rad / _SHARE for peak in _PEAKS)
     return np.asarray(np.maximum.reduce([v / speed, np.sqrt(a / acceleration), np.cbrt(j / jerk)]).clip(GENTLE_S))
 
@@ -101,8 +101,8 @@ class Recovery(NamedTuple):
     Attributes:
         found_rad: angle at which each joint was found.
         edge_rad: the near end of its range.
-        duration_s: of its curve.
-        elapsed_s: since it was found.
+        duration_s: duration of its curve.
+        elapsed_s: time since the joint was found.
     """
 
     found_rad: Doubles
@@ -131,7 +131,7 @@ class Recovery(NamedTuple):
         return curve
 
     def guided(self, reference_rad: Doubles) -> Doubles:
-        """Return references (3, J), with the curve in place of those that are farther out than it, or not finite."""
+        """Return references (3, J); the curve replaces those that are farther out than it, or not finite."""
         curve = self.now()
         way_out = np.sign(self.found_rad - self.edge_rad)
         with np.errstate(invalid="ignore"):
@@ -160,8 +160,8 @@ class _Bounds:
     """A range in force, prepared for the array arithmetic.
 
     Attributes:
-        range: (J,).
-        middle: (J,).
+        range: (J,) the range in force.
+        middle: (J,) its middle.
         floor, ceiling: (3, J) just outside the limits: values farther out are moved here, because 1e300 overflows.
         needed: (10, J) bounds of the sizes that `JerkLimiter._needed` returns.
     """
@@ -200,7 +200,7 @@ class JerkLimiter:
 
     def restart(self, joints: Bools, angles_rad: Doubles, state: LimiterState) -> LimiterState:
         """Return the state with some `joints` (J,) at rest at `angles_rad` (J,), in range or not."""
-        # Torque was off meanwhile: whatever speed the joint had by the last command is gone.
+        # Torque was off meanwhile: the speed of the last command is gone.
         still = np.zeros_like(angles_rad)
         motion = np.where(joints, np.stack([angles_rad, still, still]), state.motion)
         if self._own.holds(motion[0]).all():
@@ -220,20 +220,20 @@ class JerkLimiter:
         guided = np.where(outside, recovery.guided(reference_rad), reference_rad)
         within = self._within(self._own.reaching(state.motion[0]))
         after, chased, refused = self._tick(guided, state.motion, within, outside)
-        # Guided joints never show a reference that is not finite to `_tick`, so it is counted here.
+        # `guided` replaces references that are not finite, so `_tick` does not see them; they are counted here.
         refused += int(np.count_nonzero(outside & ~np.isfinite(reference_rad).all(axis=0)))
-        # Once all are in, they are in for good: the range in force never reaches out again.
+        # Once all joints are inside, they stay inside: the range in force never reaches out again.
         still_out = recovery if not self._own.holds(after[0]).all() else None
         return after[0].copy(), LimiterState(after, still_out, state.chased + chased, state.refused + refused)
 
     def brake(self, state: LimiterState) -> tuple[Doubles, LimiterState]:
-        """Brake every joint for one tick, as fast as its limits allow; one that stands stays.
+        """Brake every joint for one tick, as fast as its limits allow; a joint that stands still stays.
 
         Returns angles (J,) that may be sent, and the state after the tick. Never leads a joint farther out than it is.
         """
         before = state.motion.T.tolist()
         after = np.array([self._braked(j, joint) for j, joint in enumerate(before)]).reshape(-1, 3).T
-        # Rounding may have left the range in force by an ulp.
+        # By rounding, an angle may be outside the range in force by an ulp.
         reach = self._own.reaching(state.motion[0])
         np.clip(after[0], reach.low, reach.high, out=after[0])
         return after[0].copy(), replace(state, motion=after)
@@ -250,11 +250,11 @@ class JerkLimiter:
         after = np.minimum(np.maximum(reference_rad, within.floor), within.ceiling)
         fine = self._needed(motion, after, within.middle) <= within.needed  # False for NaN
         if outside is not None:
-            fine[6:, outside] = False  # the bounds of a stop do not know that it must not turn back
+            fine[6:, outside] = False  # the bounds of a stop do not check that it never turns back
         chased = refused = 0
         if np.count_nonzero(fine) < fine.size:
             hard = np.flatnonzero(~np.logical_and.reduce(fine, axis=0))
-            met = np.logical_and.reduce(fine[:6, hard], axis=0)  # in one tick; only the stop is in doubt
+            met = np.logical_and.reduce(fine[:6, hard], axis=0)  # reached in one tick; only the stop is in doubt
             each = [*motion[:, hard], *reference_rad[:, hard], *after[:, hard], low[hard], high[hard]]
             settled = []
             for j, ok, column in zip(hard.tolist(), met.tolist(), np.stack(each).T.tolist(), strict=True):
@@ -268,7 +268,7 @@ class JerkLimiter:
                     settled.append(self._chased(j, before, wanted, *ends))
                     chased += 1
             after[:, hard] = np.array(settled).T
-        # Rounding may have left the range by an ulp.
+        # By rounding, an angle may be outside the range by an ulp.
         np.maximum(after[0], low, out=after[0])
         np.minimum(after[0], high, out=after[0])
         return after, chased, refused
@@ -280,9 +280,9 @@ class JerkLimiter:
             return lawful(state, low, high, bound)
         if not low <= state[0] <= high:
             return False
-        if first <= state[0] <= last:  # it comes in: from here on the own range holds
+        if first <= state[0] <= last:  # the joint comes in: from here on its own range applies
             return lawful(state, first, last, bound)
-        # Still outside: the side on which the range in force reaches out tells the way in. Its stop must not turn back.
+        # Still outside: the side on which the range in force reaches out shows the way in. The stop must not turn back.
         way = 1.0 if low < first else -1.0
         return lawful(state, low, high, bound) and moves_in(state, way, bound)
 
@@ -290,7 +290,7 @@ class JerkLimiter:
         low, high = limits.low, limits.high
         ceiling = np.stack([1 + high, 2 * self._speed, 2 * self._acceleration])
         half = (high - low) / 2 + _EDGE_SLACK_RAD
-        # Rows as in `_needed`: three jerks, two accelerations, the way of one tick;
+        # Rows as in `_needed`: three jerks, two accelerations, and the way of one tick,
         one_tick = [self._jerk] * 3 + [self._acceleration] * 2 + [self._speed * self._dt_s]
         # then speed and acceleration of the stop, and half the range, along its way and against it.
         stop = [self._speed * (1 + SLACK), self._acceleration * (1 + SLACK), half, half]
@@ -314,7 +314,7 @@ class JerkLimiter:
         lasts = size / self._jerk
         gain = 0.5 * size * lasts
         np.add(speed, gain, out=top)
-        # The way of the stop is that of the speed once the acceleration is gone.
+        # The stop has the direction of the speed once the acceleration is gone.
         onward = v + np.copysign(gain, a)
         off = q - middle
         # Along its way a stop is no longer than |a| / J at the highest speed, then a whole stop from it: the ramp of
@@ -325,16 +325,16 @@ class JerkLimiter:
         return np.abs(out, out=out)
 
     def _chased(self, j: int, before: State, wanted: State, low: float, high: float) -> State:
-        """Return joint j one tick on its way to the possible part of `wanted`; braked where that is not lawful."""
+        """Return joint j one tick farther on its way to the possible part of `wanted`; braked if that is not lawful."""
         target = _possible(wanted, low, high, self._bounds[j])
         lawful_next = partial(self._lawful, j, low=low, high=high)
         after = self._chase.step(j, before, target, lawful_next)
         if (low, high) != self._ends[j]:
-            # To meet a moving reference, a joint may want a run-up. Outside its own range it must not turn back.
+            # A joint may back up first to meet a moving reference. Outside its own range it must not turn back.
             still = self._chase.step(j, before, (target[0], 0.0, 0.0), lawful_next)
             way = 1.0 if low < self._ends[j][0] else -1.0
             after = max((each for each in (after, still) if each), key=lambda each: way * each[1], default=None)
-        # The braking curve of a lawful state is lawful: there is always this way out.
+        # The braking curve of a lawful state is lawful, so braking is always possible.
         return self._braked(j, before) if after is None else after
 
     def _braked(self, j: int, before: State) -> State:
@@ -351,8 +351,8 @@ def _one_tick(dt: float) -> Doubles:
     # With jerks j held for h = dt / 3 each, a tick of length 1 leads from x to
     #   a' = a + (j1 + j2 + j3) / 3,   v' = v + a + (5 j1 + 3 j2 + j3) / 18,
     #   q' = q + v + a / 2 + (19 j1 + 7 j2 + j3) / 162,
-    # the weights being `_JERKS_FOR` inverted. `missing` is the part of x' that jerk 0 does not reach, as jerk over the
-    # whole tick: its rows are a' - a, v' - v - a dt, q' - q - v dt - a dt^2 / 2, divided by dt, dt^2, dt^3.
+    # with the inverse of `_JERKS_FOR` as weights. `missing` is the part of x' that jerk 0 does not reach, as jerk over
+    # the whole tick: its rows are a' - a, v' - v - a dt, q' - q - v dt - a dt^2 / 2, divided by dt, dt^2, dt^3.
     missing = np.array(
         [
             [0, 0, -1 / dt, 0, 0, 1 / dt],
@@ -375,7 +375,7 @@ def _possible(wanted: State, low: float, high: float, bound: Bound) -> State:
     acceleration = _clipped(wanted[2], -bound.acceleration, bound.acceleration)
     if lawful(wanted, low, high, bound):
         return position, speed, acceleration
-    if position == wanted[0]:  # outside, it is to stop at the edge
+    if position == wanted[0]:  # for a position outside, the target is a stop at the edge
         for target in ((position, speed, acceleration), (position, speed, 0.0)):
             if lawful(target, low, high, bound):
                 return target

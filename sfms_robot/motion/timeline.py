@@ -1,22 +1,22 @@
 """Joining of plans, and their playback at any instant with continuous speed and acceleration.
 
-A plan gives a face every 40 ms; servos want one every tick, at tick time plus their own lead. Between two frames
+A plan has a face every 40 ms; servos need one every tick, at tick time plus their own lead. Between two frames
 every channel follows a quintic that matches value, slope and curvature at both ends, so that the jerk
 limiter behind it has nothing to correct. Two rules for slope and curvature at a frame:
 
 - pose: central differences of fourth order (second order where frames are unevenly spaced or too few). The head
   may swing a little past a frame, as a head does.
-- blendshapes: the harmonic-mean slopes of Fritsch and Carlson (1980), no curvature beside a flat stretch, and the
+- blendshapes: the harmonic-mean slopes of Fritsch and Carlson (1980), no curvature next to a flat stretch, and the
   curve kept between the two frames' values: it never overshoots, so 0 stays 0 and a closed lid stays closed.
 
-A blink is two frames long; a peak that falls between two ticks would be shaved off, and a lid servo that is slower
+A blink is two frames long; a peak that falls between two ticks would be cut off, and a lid servo that is slower
 than the blink would turn back before it has closed. The blink channels are therefore widened by half a frame on
 either side: the lid starts a little early and stays closed for a whole frame.
 
-A newer plan replaces the older from its first time on. Where both have a frame they are blended over two frames,
-blinks by maximum. Instants that were played already (leads included), and the piece of curve in play, do not
-change: a late plan bends the future, it never makes the present jump. Past the last frame the curve continues for one
-frame at most, then holds. A plan that comes too late for all its frames still gives the next target of the face. After
+A newer plan replaces the older one from its first time on. Where both have a frame they are blended over two frames,
+blinks by maximum. Instants that were played already (leads included), and the piece of curve in play, do not change:
+a late plan changes the future, but never makes the present face jump. Past the last frame the curve continues for one
+frame at most, then holds. A plan that comes too late for all its frames still sets the next target of the face. After
 half a second without a plan the face eases to neutral.
 
 A lead needs the future of the plan in force, which is limited: the part that is left when the next plan comes is
@@ -53,8 +53,8 @@ BLEND_FRAMES = 2
 STALL_S = 0.5  # without a plan for this long, ease to neutral
 EASE_S = 1.0
 HISTORY = 8  # frames kept before the one in play
-LEAD_S = 0.25  # the limit of a lead before anything is measured
-FALL, RISE = 0.25, 0.02  # how fast the limit follows, seconds a second: it stays with the shortest that was left
+LEAD_S = 0.25  # limit of leads before anything is measured, and highest value of `left_s`
+FALL, RISE = 0.25, 0.02  # s per s by which the limit falls and rises: it stays near the shortest time that was left
 _EVEN = 1e-3  # frames count as evenly spaced within this share of a frame
 _FARTHEST = 1e6  # m or rad
 _JAW_OPEN = CHANNEL_INDEX["jawOpen"]
@@ -80,7 +80,7 @@ class Curve:
         knots: K frames; the curve is known up to `end_s`, the last but one.
         coefficients: (K-1, 6, 58) of the powers 0..5 of the position in the piece, 0..1.
         low, high: (K-1, 58) bounds of each piece.
-        made_at_s: of the newest plan.
+        made_at_s: time at which the newest plan was made.
         delay_s: one frame for plans of a single frame, which could not be interpolated otherwise.
     """
 
@@ -104,10 +104,10 @@ class TimelineState:
         curve: None before the first plan.
         played_s: latest instant of the curve that was sampled.
         held: samples that ran past the horizon and one frame more.
-        eased: samples on the way to neutral, or there, for lack of a plan.
+        eased: samples on the way to neutral, or at neutral, because there was no plan.
         late: plans whose frames were all in the past.
         refused: discarded plans: not finite, or older than the one before.
-        now_s: of the last tick.
+        now_s: time of the last tick.
         until_s: last time of the plan in force.
         left_s: time left of the plan in force at the last tick before a newer one came.
         lead_limit_s: follows `left_s`, never below 0.
@@ -129,7 +129,7 @@ class PlanTimeline:
     """The timeline of a run (`ports.Timeline`).
 
     Args:
-        tick_s: period of the ticks it will be sampled at; blinks are widened by half of it where it is longer than
+        tick_s: period at which the timeline is sampled; blinks are widened by half of it where it is longer than
             a frame.
     """
 
@@ -167,7 +167,7 @@ class PlanTimeline:
         return replace(state, curve=curve, played_s=played_s, late=state.late + late, until_s=until_s, left_s=left_s)
 
     def lead_limit_s(self, state: TimelineState) -> float:
-        """Return the longest time after a tick [s] that `sample` can give without running past the plan in force."""
+        """Return the longest lead after a tick [s] with which `sample` does not run past the plan in force."""
         return state.lead_limit_s
 
     def sample(self, times_s: Doubles, now_s: float, state: TimelineState) -> tuple[Floats, TimelineState]:
@@ -175,7 +175,7 @@ class PlanTimeline:
 
         `now_s` is the time of the tick; instants after it are leads.
         """
-        # The limit of leads comes a little nearer to the time left of plans.
+        # The limit of leads moves a little toward the time that was left of the last plan.
         dt_s = max(now_s - state.now_s, 0.0) if math.isfinite(state.now_s) else 0.0
         limit_s = min(max(state.left_s, state.lead_limit_s - FALL * dt_s), state.lead_limit_s + RISE * dt_s)
         curve, limit_s = state.curve, max(limit_s, 0.0)
@@ -205,7 +205,7 @@ class PlanTimeline:
 
 
 def _distinct(times_s: Doubles) -> tuple[Doubles, Indices]:
-    """Return the instants, each once, and the place of each of (N,) among them: joints share their leads."""
+    """Return the distinct instants, and the index of each of (N,) among them. Joints share their leads."""
     seen: dict[float, int] = {}
     which = [seen.setdefault(time_s, len(seen)) for time_s in times_s.tolist()]
     return np.array(list(seen)), np.array(which, dtype=np.intp)
@@ -219,10 +219,10 @@ def _blend(before: Doubles, after: Doubles, share: float) -> Doubles:
 
 
 def _usable(plan: Plan) -> tuple[Doubles, Doubles] | None:
-    """Return times (H,) and frames (H, 58) of a plan; None for one that is not finite, in time order and 58 wide.
+    """Return times (H,) and frames (H, 58) of a plan; None unless it is finite, in time order and 58 wide.
 
-    Blendshapes are in 0..1, and the jaw pose, if any, in the place of jawOpen. A pose is cut to `_FARTHEST`, so that no
-    curve through it overflows.
+    Blendshapes are clipped to 0..1, and the jaw pose, if any, replaces jawOpen. A pose is clipped to `_FARTHEST`, so
+    that no curve through it overflows.
     """
     times_s, frames = np.asarray(plan.times_s, dtype=np.float64), np.array(plan.frames, dtype=np.float64)
     if times_s.ndim != 1 or not len(times_s) or frames.shape != (len(times_s), MOTION_DIM):

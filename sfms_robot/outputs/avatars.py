@@ -1,4 +1,4 @@
-"""Avatar software that takes a face over UDP: the VMC protocol, and Live Link Face's packets.
+"""Outputs to avatar software that receives a face over UDP: the VMC protocol, and Live Link Face's packets.
 
     --output vmc[:HOST:PORT]          VSeeFace, VNyan, Warudo, Blender, Unity: 50 faces a second, in bundles
     --output vmc-single[:HOST:PORT]   the same, each message in a packet of its own, 25 a second
@@ -7,11 +7,11 @@
 VMC (protocol.vmc.info, "Marionette"): OK, T, Bone/Pos of Neck, Head, LeftEye and RightEye, Blend/Val of the 52 ARKit
 names ("perfect sync"), Blend/Apply. Unity's axes are left-handed, x right, y up, z forward: a turn about (a, b, c) in
 ours is one about (b, -c, -a) there, the inverse of `sources.vmc.turn_of_unity`. Neck and head turn half each. Positions
-of bones are lengths of a skeleton, which is the receiver's, so 0 is sent, as face trackers do.
+of bones depend on the skeleton, which the receiver has, so 0 is sent, as face trackers do.
 
-Live Link: the packet of `sources.live_link`, version 6, 61 values. Neither has a position of the head.
+Live Link: the packet of `sources.live_link`, version 6, 61 values. Neither protocol has a position of the head.
 
-UDP has no connection. Only on this machine is a receiver that is away noticed: the system refuses the packets.
+UDP has no connection. A receiver that is away is noticed only on this machine, where the system refuses the packets.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ from sfms_robot.outputs.registry import parse_address
 from sfms_robot.ports import Facts, Output, OutputFrame
 from sfms_robot.signals.gaze_kinematics import EYES_RAD, directions
 
-SUBJECT: Final = "sfms-robot"  # as Unreal lists it
-LARGEST_PACKET: Final = 1400  # bytes, so that no network cuts it in two
-_RATE: Final = 50  # of Live Link
-_DAY: Final = 86_400 * _RATE  # frames
+SUBJECT: Final = "sfms-robot"  # name in Unreal's list
+LARGEST_PACKET: Final = 1400  # bytes, so that no network splits it
+_RATE: Final = 50  # frames a second of Live Link
+_DAY: Final = 86_400 * _RATE  # frames a day
 
 
 class UdpOutput(Output):
-    """An output that sends packets to one address. A subclass has `packets`, its receiver's usual port and advice."""
+    """An output that sends packets to one address. A subclass defines `packets`, `usual_port` and `advice`."""
 
     usual_port: int
     advice: str
@@ -62,18 +62,18 @@ class UdpOutput(Output):
         self._socket.connect(where)
 
     def send(self, frame: OutputFrame, now_s: float) -> None:
-        """Send the packets of a frame. Raises OutputError where nothing listens."""
+        """Send the packets of a frame. Raises OutputError if nothing listens."""
         assert self._socket is not None
         for packet in self.packets(frame, now_s):
             try:
                 self._bytes += self._socket.send(packet)
-            except BlockingIOError:  # a network that is full: the next frame is newer
+            except BlockingIOError:  # the network is full: leave the rest out, the next frame is newer
                 return
             except ConnectionRefusedError as error:
                 raise OutputError(f"nothing listens there: {self.advice}") from error
 
     def packets(self, frame: OutputFrame, now_s: float) -> Sequence[bytes | bytearray]:
-        """Return what is sent of a frame."""
+        """Return the packets of a frame."""
         raise NotImplementedError
 
     def statistics(self) -> Facts:
@@ -115,16 +115,16 @@ def unity_quaternion(roll: float, pitch: float, yaw: float, share: float = 1.0) 
 
 
 class VmcOutput(UdpOutput):
-    """VMC, in bundles of up to `LARGEST_PACKET` bytes. All messages have one length for good: numbers are filled in."""
+    """VMC, in bundles of up to `LARGEST_PACKET` bytes. Messages keep their lengths: only numbers are filled in."""
 
-    kind, usual_port = "vmc", 39539  # the port that the protocol gives receivers
+    kind, usual_port = "vmc", 39539  # the receivers' port in the protocol
     advice = "start the avatar software and switch on its VMC receiver, or check the port"
     _bundled = True
 
     def __init__(self, argument: str = "") -> None:
         super().__init__(argument)
         self._packets: list[bytearray] = []
-        self._places: list[tuple[bytearray, int]] = []  # of each message: its packet, and where its numbers begin
+        self._places: list[tuple[bytearray, int]] = []  # of each message: packet, and index of its numbers
         self._pack(_osc("/VMC/Ext/OK", "iiii"), 16)
         packet, at = self._places.pop()
         struct.pack_into(">iiii", packet, at, 1, 3, 0, 1)  # loaded, calibrated, mode normal, tracking
@@ -157,7 +157,7 @@ class VmcOutput(UdpOutput):
 
 
 class VmcSingleOutput(VmcOutput):
-    """VMC for receivers that read no bundles."""
+    """VMC for receivers that cannot read bundles."""
 
     kind, rate_hz = "vmc-single", 25.0
     _bundled = False
@@ -169,7 +169,7 @@ _ORDER: Final = [CHANNEL_INDEX[name] for name in (*ORDERS["live_link_udp"], "yaw
 
 
 class LiveLinkOutput(UdpOutput):
-    """Live Link Face's packets. Frames are counted from midnight on, as the app does."""
+    """Live Link Face's packets. Frames are counted from midnight on, as in the app."""
 
     kind, usual_port, rate_hz = "live-link", 11111, float(_RATE)
     advice = "start Unreal with its Live Link plug-in, or check the port"
@@ -186,7 +186,7 @@ class LiveLinkOutput(UdpOutput):
             here = time.localtime()
             self._midnight_s = now_s - (here.tm_hour * 60 + here.tm_min) * 60 - here.tm_sec
         due = round((now_s - self._midnight_s) * _RATE)
-        # One after the other: by the clock alone, a frame that is a little late would skip a number.
+        # Numbers are consecutive: by the clock alone, a frame that is a little late would skip a number.
         self._number = self._number + 1 if abs(self._number + 1 - due) < _RATE / 2 else due
         eyes = [each for turn, tilt in directions(frame.motion, EYES_RAD).tolist() for each in (turn, tilt, 0.0)]
         values = np.array([*frame.motion[_ORDER], *eyes], ">f4").tobytes()

@@ -9,7 +9,8 @@ JSON events over ws://HOST:9000/v1/events:
                              NECK_ROLL and GAZE_PAN, GAZE_TILT in degrees
 
 The eight EYE_LOOK shapes are 0, because GAZE turns the eyes. Signs are those of the maker's telepresence example,
-where a tracked person's yaw to the own left, pitch down and roll to the right ear are +, as here. No robot was tried.
+where a tracked person's yaw to the own left, pitch down and roll to the right ear are +, as here. It was not tried with
+a robot.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from sfms_robot.signals.gaze_kinematics import EYES_RAD, directions
 
 KEY: Final = "FURHAT_KEY"
 
-_OWN: Final = ("blinking", "microexpressions", "head_sway")  # of the robot
+_OWN: Final = ("blinking", "microexpressions", "head_sway")  # motions that the robot makes itself
 _NAMES: Final = ["".join(f"_{each}" if each.isupper() else each.upper() for each in name) for name in BLENDSHAPES]
 _LOOKS: Final = [place for place, name in enumerate(BLENDSHAPES) if name.startswith("eyeLook")]
 _NECK: Final = {"NECK_PAN": "yaw", "NECK_TILT": "pitch", "NECK_ROLL": "roll"}
@@ -54,7 +55,7 @@ class Furhat(WebSocketOutput):
     """Face, eyes and neck of a Furhat."""
 
     kind = "furhat"
-    neutral_s = 1.0  # of the way to neutral
+    neutral_s = 1.0  # duration of the way to neutral
     usual_port = 9000
     path = "/v1/events"
     absent = "name the robot's host and switch on its Realtime API"
@@ -87,7 +88,7 @@ class Furhat(WebSocketOutput):
                 raise OutputError(f"answers {message.get('type')}: {message.get('message') or message}")
 
     def farewell(self) -> None:
-        """Give blinking and sway back to the robot."""
+        """Switch the robot's own blinking, microexpressions and sway on again."""
         self._configure(own=True)
 
     def _configure(self, own: bool) -> None:

@@ -1,6 +1,6 @@
 """Face and pose as JSON to WebSocket clients of this machine: `--output json[:PORT]`.
 
-One object a frame, 50 a second, newest first for a client that reads slowly:
+One object a frame, 50 a second:
 
     t             loop time [s]
     state         of the run
@@ -11,12 +11,12 @@ One object a frame, 50 a second, newest first for a client that reads slowly:
     ts            loop time [ms], a whole number
     source, frame "sfms-robot", "base"
 
-The last four are what stackchan-mcp's pose follower reads, beside yaw and pitch.
+ts, source and frame are there for stackchan-mcp's pose follower, which reads them together with yaw and pitch.
 
-Limits, those of the page: requests with a name of another machine (Host), or of a page of another site (Origin), are
-refused; a connection that is not open after `CONNECTION_S` is closed, and the oldest of these makes room where there
-are `MOST_CLIENTS`; a client that reads slowly misses frames; one that sends more than `MOST_RECEIVED` messages, which
-are not read, is disconnected.
+The limits are those of the page. Requests with a name of another machine (Host), or of a page of another site (Origin),
+are refused. A connection that is not open after `CONNECTION_S` is closed, and if there are `MOST_CLIENTS` of these, the
+oldest makes room. A client that reads slowly misses frames. A client that sends more than `MOST_RECEIVED` messages,
+which are not used, is disconnected.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ CONNECTION_S: Final = 10.0
 MOST_RECEIVED: Final = 100
 MOST_UNREAD: Final = 65_536  # bytes that wait for a client; with more it misses frames
 _RECEIVED_S: Final = 0.01  # pause after each message of a client
-_LONGEST: Final = 4096  # bytes of one
+_LONGEST: Final = 4096  # bytes of a client's message
 _STOP_S: Final = 1.0
 _SOURCE: Final = "sfms-robot"
 _DEGREES: Final = 57.29577951308232
 
 logger = logging.getLogger(__name__)
-_handshakes = logging.getLogger(f"{__name__}.handshakes")  # those that fail are no trouble of the run
+_handshakes = logging.getLogger(f"{__name__}.handshakes")  # failed handshakes are not a problem of the run
 _handshakes.setLevel(logging.CRITICAL)
 
 
@@ -99,11 +99,11 @@ class JsonStream(ServerThread, Output):
         super().__init__("--output json", LOOPBACK, port, 2 * _STOP_S)
         self.peer = address_text(*self.address)
         self._counts = dict.fromkeys(("refused", "missed"), 0)
-        self._clients = set[ServerConnection]()  # open; for the server's thread
-        self._opening: dict[ServerConnection, None] = {}  # oldest first
+        self._clients = set[ServerConnection]()  # open connections; used in the server's thread
+        self._opening: dict[ServerConnection, None] = {}  # connections that are not open yet, oldest first
 
     def open(self) -> None:
-        """Take clients from now on. Idempotent."""
+        """Accept clients from now on. Idempotent."""
         if self._thread.ident is None:
             self.start()
             logger.log(NOTE, "output json: ws://%s/", self.peer)
@@ -111,11 +111,11 @@ class JsonStream(ServerThread, Output):
     def send(self, frame: OutputFrame, now_s: float) -> None:
         """Send a frame to each client that reads."""
         if self._clients:
-            with suppress(RuntimeError):  # closed
+            with suppress(RuntimeError):  # the server's loop is closed
                 self._loop.call_soon_threadsafe(self._send, json_of(frame).decode())
 
     def statistics(self) -> Facts:
-        """Return connected clients, refused ones, and frames that slow ones missed."""
+        """Return counts of connected clients, of refused requests, and of frames that slow clients missed."""
         return {"clients": len(self._clients), **self._counts}
 
     def _send(self, message: str) -> None:
@@ -143,7 +143,7 @@ class JsonStream(ServerThread, Output):
             await self._closing.wait()
 
     def _problem(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the answer to a request that is refused."""
+        """Return the answer to a request that is refused; None to accept it."""
         host = request.headers.get("Host", "")
         problem = host_problem(host) or origin_problem(request.headers.get("Origin"), host)
         if problem is None and len(self._clients) >= MOST_CLIENTS:
@@ -169,18 +169,18 @@ class JsonStream(ServerThread, Output):
 
 
 class RoomyConnection(ServerConnection):
-    """Connection that makes room for itself where too many are still opening. `opening`: those, oldest first."""
+    """Connection that makes room for itself if too many are still opening. `opening`: these, oldest first."""
 
     opening: dict[ServerConnection, None]
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Abort the oldest of too many."""
+        """Abort the oldest connection that is not open yet if there are too many."""
         super().connection_made(transport)
         if len(self.opening) >= MOST_CLIENTS:
             next(iter(self.opening)).transport.abort()
         self.opening[self] = None
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Count no longer."""
+        """Remove the connection from `opening`."""
         self.opening.pop(self, None)
         super().connection_lost(exc)

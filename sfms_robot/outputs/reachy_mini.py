@@ -1,20 +1,20 @@
 """Reachy Mini through its maker's daemon: `--output reachy-mini[:HOST:PORT]` and `reachy-mini-overlay[:HOST:PORT]`.
 
-Sent as JSON to ws://HOST:8000/ws/sdk (read at pollen-robotics/reachy_mini 1.13, and tried with its daemon):
+JSON messages over ws://HOST:8000/ws/sdk (read at pollen-robotics/reachy_mini 1.13, and tried with its daemon):
 
-    goto_target         head, antennas, body_yaw, duration   once, to neutral; targets are ignored meanwhile
-    set_full_target     head, antennas, body_yaw             `reachy-mini`, each frame
-    set_speech_offsets  x, y, z, roll, pitch, yaw            `reachy-mini-overlay`, each frame; the daemon adds it to
-                                                             whatever app or move runs, and keeps the last one
-    head_pose           4x4                                  comes back 50 times a second
-    daemon_status       state, motor mode                    comes back once a second
+    goto_target         head, antennas, body_yaw, duration   sent once, to neutral; targets are ignored meanwhile
+    set_full_target     head, antennas, body_yaw             sent by `reachy-mini`, each frame
+    set_speech_offsets  x, y, z, roll, pitch, yaw            sent by `reachy-mini-overlay`, each frame; the daemon adds
+                                                             it to any app or move that runs, and keeps the last one
+    head_pose           4x4                                  received 50 times a second
+    daemon_status       state, motor mode                    received once a second
 
 Axes, units and Euler order are ours. Antennas (right, left) [rad] and body move as those of the shipped head
 reachy_mini do: the body takes the yaw beyond 40 degrees.
 
-The daemon ignores a pose that its legs do not reach. So the head's lean (roll and pitch together) stays within 35
-degrees of the maker's 40, and its shift shrinks with the lean to 0: each such pose is within reach of
-`retarget.stewart`, which a test holds.
+The daemon ignores a pose that its legs do not reach. The head's lean (roll and pitch together) therefore stays within
+35 degrees, where the maker allows 40, and its shift shrinks to 0 as the lean grows. A test checks that each such pose
+is within reach of `retarget.stewart`.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.rotations import rotation
 
 RATE_HZ: Final = 50.0  # more than 100 targets a second overload a daemon
-_SETTLE_S: Final = 0.2  # until the daemon takes targets again after the way to neutral
-_KNOWN_MAJOR: Final = "1"  # version of the daemon
-_NEAR_RAD, _NEAR_M = 0.2, 0.02  # from where it is sent
-_APART_S: Final = 0.5  # longest time farther away: then it eases in again, which the daemon would not do by itself
+_SETTLE_S: Final = 0.2  # until the daemon accepts targets again after the way to neutral
+_KNOWN_MAJOR: Final = "1"  # major version of the daemon
+_NEAR_RAD, _NEAR_M = 0.2, 0.02  # a head this close to its goal is near it
+_APART_S: Final = 0.5  # longest time not near the goal; then the output eases in again, which the daemon does not do
 _DRIVEN: Final = "another move or program drives it, or something holds its head"
 
 LEAN_RAD: Final = math.radians(35)
 SHIFT_M: Final = 0.015
-_NECK_RAD: Final = math.radians(40)  # of yaw that the head takes before the body
+_NECK_RAD: Final = math.radians(40)  # yaw of the head, beyond which the body turns
 _BODY_RAD: Final = math.radians(160)
 
-# The antennas: weights of channels for the right one; the left one has left and right changed.
+# Weights of channels for the right antenna. For the left antenna left and right are swapped.
 ANTENNA: Final[Mapping[str, float]] = {
     "browInnerUp": 0.8, "browOuterUpLeft": 0.1, "browOuterUpRight": 0.5, "browDownLeft": -0.1, "browDownRight": -0.5,
     "mouthSmileLeft": 0.15, "mouthSmileRight": 0.15, "mouthFrownLeft": -0.15, "mouthFrownRight": -0.15,
@@ -59,11 +59,11 @@ _WEIGHTS: Final = np.stack([_RIGHT, _RIGHT[[CHANNELS.index(other_side(name)) for
 _REST_RAD: Final = np.radians([-10.0, 10.0])
 _RAISED_RAD: Final = np.radians([40.0, -40.0])
 
-_HISTORY: Final = int(30 * RATE_HZ)  # frames that are compared with what the daemon reports
+_HISTORY: Final = int(30 * RATE_HZ)  # sent frames that are compared with the daemon's reports
 _WINDOW_S: Final = 5.0
 _LAGS_S: Final = np.arange(0.0, 0.3, 0.004)
 _NEARLY_0: Final = 1e-3  # rad, m
-_MOVES_RAD: Final = 0.003  # deviation of a window in which a lag can be seen
+_MOVES_RAD: Final = 0.003  # smallest standard deviation in a window for measuring a lag
 
 _TURN: Final = ChannelLimit(-LEAN_RAD, LEAN_RAD, math.radians(250), math.radians(3000))
 _SHIFT: Final = ChannelLimit(-SHIFT_M, SHIFT_M, 0.15, 3.0)
@@ -82,7 +82,7 @@ def in_reach(pose: Doubles) -> Doubles:
 
 
 def body_yaw(yaw_rad: float) -> float:
-    """Return the body's part of a yaw: what is beyond the neck's."""
+    """Return the body's part of a yaw: the part beyond that of the neck."""
     beyond = yaw_rad - min(max(yaw_rad, -_NECK_RAD), _NECK_RAD)
     return min(max(beyond, -_BODY_RAD), _BODY_RAD)
 
@@ -101,10 +101,10 @@ def matrix(pose: Doubles) -> Doubles:
 
 
 def following(sent: Sequence[tuple[float, float]], reported: Sequence[tuple[float, float]]) -> dict[str, float | None]:
-    """Return how an angle that is reported follows the one that was sent, both as (time [s], angle [rad]).
+    """Return how a reported angle follows the one that was sent, both as (time [s], angle [rad]).
 
-    The lag is that of the best correlation in windows of 5 s, their median; the correlation is that of all at this
-    lag. None where too little moved.
+    The lag is the median of the lags with the best correlation in windows of 5 s. The correlation is that of all values
+    at this lag. Both are None if the angles hardly moved.
     """
     unknown: dict[str, float | None] = {"pitch_correlation": None, "lag_ms": None}
     if min(len(sent), len(reported)) < 2:
@@ -127,14 +127,14 @@ def following(sent: Sequence[tuple[float, float]], reported: Sequence[tuple[floa
 
 
 def _correlations(goals: Doubles, angles: Doubles) -> Doubles | None:
-    """Return the correlation (k,) of goals (k, n) and angles (n,); None where one of them hardly moves."""
+    """Return the correlation (k,) of goals (k, n) and angles (n,); None if one of them hardly moves."""
     if min(goals.std(axis=1).min(), angles.std()) < _MOVES_RAD:
         return None
     return np.corrcoef(goals, angles)[-1, :-1]
 
 
 class ReachyDaemon(WebSocketOutput):
-    """An output to the daemon. It checks, at first and once a second, that the robot can be driven."""
+    """An output to the daemon. It checks, at the start and once a second, that the robot can be driven."""
 
     usual_port = 8000
     path = "/ws/sdk"
@@ -148,7 +148,7 @@ class ReachyDaemon(WebSocketOutput):
                 self._check_status(message)
 
     def check(self) -> None:
-        """Raise OutputError where the daemon or the robot cannot be driven now."""
+        """Raise OutputError if the daemon or the robot cannot be driven now."""
         status = self._get("/api/daemon/status")
         self._check_status(status)
         version = str(status.get("version"))
@@ -180,10 +180,10 @@ class ReachyDaemon(WebSocketOutput):
 
 
 class ReachyMini(ReachyDaemon):
-    """Head, antennas and body of a Reachy Mini. Begins by the daemon's own way to neutral."""
+    """Head, antennas and body of a Reachy Mini. It begins with the daemon's own way to neutral."""
 
     kind = "reachy-mini"
-    neutral_s = 1.5  # of the way to neutral
+    neutral_s = 1.5  # duration of the way to neutral
     limits: Mapping[str, ChannelLimit] = {
         "roll": _TURN,
         "pitch": _TURN,
@@ -196,8 +196,8 @@ class ReachyMini(ReachyDaemon):
         super().__init__(address)
         self._sent = deque[tuple[float, float]](maxlen=_HISTORY)
         self._reported = deque[tuple[float, float]](maxlen=_HISTORY)
-        self._goal = np.eye(4)  # sent last
-        self._together_s: float | None = None  # when the head was last seen near it
+        self._goal = np.eye(4)  # the pose that was sent last
+        self._together_s: float | None = None  # time at which the head was last near it
 
     def greet(self) -> None:
         self.check()
@@ -232,7 +232,7 @@ class ReachyMini(ReachyDaemon):
     def heard(self, messages: Sequence[Message], now_s: float) -> None:
         super().heard(messages, now_s)
         poses = [_reported(each) for each in messages if each.get("type") == "head_pose"]
-        for back, pose in zip(range(len(poses) - 1, -1, -1), poses, strict=True):  # the newest came now
+        for back, pose in zip(range(len(poses) - 1, -1, -1), poses, strict=True):  # the newest arrived now
             self._reported.append((now_s - back / RATE_HZ, _pitch(pose)))
         if self._together_s is None or not poses or _near(poses[-1], self._goal):
             self._together_s = now_s
@@ -245,7 +245,7 @@ class ReachyMini(ReachyDaemon):
 
 
 class ReachyMiniOverlay(ReachyDaemon):
-    """An offset on top of what an app or the daemon does with the head."""
+    """An offset on top of the head's motion by an app or the daemon."""
 
     kind = "reachy-mini-overlay"
     limits: Mapping[str, ChannelLimit] = {
@@ -258,7 +258,7 @@ class ReachyMiniOverlay(ReachyDaemon):
         self._last = np.zeros(6)  # offset that the daemon may still have
 
     def greet(self) -> None:
-        """Ease an offset that is left from before a break in the network to 0."""
+        """Ease an offset that was left by a break in the network to 0."""
         self.check()
         steps = int(RATE_HZ) if self._last.any() else 1
         for left in self._last * (1.0 - ease(np.arange(1, steps + 1) / steps))[:, None]:
@@ -273,11 +273,11 @@ class ReachyMiniOverlay(ReachyDaemon):
 
     def close(self) -> None:
         if self._link is not None and self._link.closed:
-            self._last = np.zeros(6)  # gone with the daemon
+            self._last = np.zeros(6)  # the offset is gone with the daemon
         super().close()
 
     def farewell(self) -> None:
-        """Make an offset of nearly 0 exactly 0; that of a halted run stays with the daemon."""
+        """Set an offset of nearly 0 to exactly 0; the offset of a halted run stays in the daemon."""
         if np.abs(self._last).max() < _NEARLY_0:
             self._send(np.zeros(6))
 

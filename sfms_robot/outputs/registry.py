@@ -1,7 +1,7 @@
-"""Values of `--output`: KIND or KIND:ADDRESS, a head that takes a face or a pose instead of joint angles.
+"""Values of `--output`: KIND or KIND:ADDRESS, a head that accepts a face or a pose instead of joint angles.
 
-A kind of another package is an entry point of the group `sfms_robot.outputs`: a callable that takes the text behind the
-colon ("" without one) and returns a `ports.Output`. Kinds are imported when they are opened.
+A kind of another package is an entry point of the group `sfms_robot.outputs`: a callable that accepts the text after
+the colon ("" without one) and returns a `ports.Output`. Kinds are imported when they are opened.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.network import LOCAL, Router
 from sfms_robot.plugins import plug_in, plugins, shipped
 
-if TYPE_CHECKING:  # numpy, which a look at a name does not need
+if TYPE_CHECKING:  # it imports numpy, which checking a name does not need
     from sfms_robot.ports import Output
 
 GROUP: Final = "sfms_robot.outputs"
@@ -57,7 +57,7 @@ def output_kinds() -> Mapping[str, EntryPoint]:
 
 
 def check_outputs(values: Sequence[str]) -> None:
-    """Check that there are such kinds. Imports and opens nothing. Raises ConfigError with the choices."""
+    """Check that the kinds exist. Imports and opens nothing. Raises ConfigError that lists the valid kinds."""
     kinds = output_kinds()
     for value in values:
         if value.partition(":")[0] not in kinds:
@@ -67,7 +67,7 @@ def check_outputs(values: Sequence[str]) -> None:
 def open_output(value: str, router: Router = LOCAL) -> Output:
     """Return the output of a value of `--output`, which is not connected yet. Raises ConfigError.
 
-    router: of ROS 2.
+    router: the router of ROS 2.
     """
     check_outputs([value])
     kind, _, address = value.partition(":")
@@ -83,7 +83,7 @@ def open_outputs(values: Sequence[str], router: Router = LOCAL) -> list[Output]:
     opened: dict[tuple[str, str], Output] = {}
     for value in values:
         output = open_output(value, router)
-        to = re.sub("-(single|add|overlay)$", "", output.kind), output.peer  # one program, whatever the way
+        to = re.sub("-(single|add|overlay)$", "", output.kind), output.peer  # variants reach the same program
         if to in opened:
             raise ConfigError(f"--output {value}: {output.peer} gets {opened[to].kind} already")
         opened[to] = output
@@ -93,7 +93,7 @@ def open_outputs(values: Sequence[str], router: Router = LOCAL) -> list[Output]:
 def parse_address(kind: str, text: str, usual_port: int) -> tuple[str, int]:
     """Return host and port of "", PORT, :PORT, HOST, HOST:PORT, [HOST] or [HOST]:PORT (IPv6 in brackets).
 
-    Loopback where no host is given. Raises ConfigError for another text, also for port 0, at which nothing listens.
+    The host is loopback if none is given. Raises ConfigError for another text, also for port 0, where nothing listens.
     """
     found = _ADDRESS.fullmatch(f":{text}" if text.isdigit() else text)
     port = found and (port_number(found["port"], 1) if found["port"] else usual_port)

@@ -5,7 +5,7 @@
     /robot_face/expression      hri_msgs/Expression: the nearest of seven of its words, with valence and arousal
     /sfms_robot/events          std_msgs/String: JSON of each nod, smile, ... when it begins
     /diagnostics                diagnostic_msgs/DiagnosticArray: state of the run, once a second and at every change
-    /robot_face/look_at         is subscribed, geometry_msgs/PointStamped in the head's frame: it looks there
+    /robot_face/look_at         subscribed, geometry_msgs/PointStamped in the head's frame: the head looks there
 
 Names are those of ROS4HRI's robots. The domain is DOMAIN, else ROS_DOMAIN_ID, else 0; Humble has no type hashes.
 """
@@ -39,14 +39,14 @@ from sfms_robot.signals.ros2_messages import (
 LOOK_AT: Final = "/robot_face/look_at"
 SENT: Final[Mapping[str, str]] = {**TYPED_TOPICS, "/sfms_robot/events": STRING}
 OPEN_S: Final = 1.8
-CHECK_S: Final = 1.0  # between two looks at the router, and two diagnostics
-FRAMES: Final = ("", "head", "head_link", "sellion_link")  # whose points need no transform
+CHECK_S: Final = 1.0  # period of checks of the router, and of diagnostics
+FRAMES: Final = ("", "head", "head_link", "sellion_link")  # frames whose points need no transform
 
 
 class Ros2Output(Output):
     """`ports.Output` of `--output ros2`. Raises ConfigError for another address.
 
-    wall: seconds since 1970, of the headers.
+    wall: function that returns seconds since 1970, for the headers.
     """
 
     kind = "ros2"

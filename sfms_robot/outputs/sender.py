@@ -1,16 +1,16 @@
-"""Motion on its way to an output: eased, limited, in a thread of its own, over losses of the peer.
+"""Motion on its way to an output: eased and limited, in a separate thread that survives losses of the peer.
 
     MotionShaper    motion that an output shows, a value passed from step to step: no jump at start, end, halt, return
     OutputSender    one output: connect, shape, send, and connect again after a loss; time is an argument of its `step`,
-                    which its thread calls at the output's rate with the newest tick of the loop, which never waits
-    Outputs         all of a run
+                    which its thread calls at the output's rate with the loop's newest tick; the loop never waits
+    Outputs         all outputs of a run
 
     phase        motion goes to                     when
-    live         that of the newest tick            the run moves
+    live         the motion of the newest tick      the run moves
     neutral      0                                  before the first tick, at the end; an avatar also in a halt
-    held         where it is                        a halt, where a machine moves
+    held         its present value                  a halt, if the output moves a machine
 
-A step to another phase takes `EASE_S`, from the motion shown so far. `Output.open` leaves its peer at neutral, so a
+A change to another phase takes `EASE_S`, from the motion shown so far. `Output.open` leaves its peer at neutral, so a
 start and a return begin there.
 """
 
@@ -33,12 +33,12 @@ from sfms_robot.ports import ChannelLimit, Facts, Observer, Output, OutputFrame,
 from sfms_robot.signals.minimum_jerk import ease
 
 EASE_S: Final = 1.0
-PAUSES_S: Final = (1.0, 10.0)  # between two tries to connect: the first, doubled each time up to the last
-PROVEN_S: Final = 0.5  # after so long without an error a connection counts: UDP reports a lost peer at a later packet
-RAMP_S: Final = 0.05  # in which a limited channel reaches its highest acceleration
-LAST_S: Final = 4.0  # that the end of all outputs may take: an `open` on its way, then the easing
-_WINDOW_S: Final = 1.0  # over which frames a second are counted
-_MOST_EVENTS: Final = 64  # that wait for their beginning
+PAUSES_S: Final = (1.0, 10.0)  # first pause between two tries to connect, and the longest; doubled each time
+PROVEN_S: Final = 0.5  # a connection counts after this time without an error: UDP reports a lost peer late
+RAMP_S: Final = 0.05  # time in which a limited channel reaches its highest acceleration
+LAST_S: Final = 4.0  # longest time for the end of all outputs: an `open` in progress, then the easing
+_WINDOW_S: Final = 1.0  # time over which frames a second are counted
+_MOST_EVENTS: Final = 64  # events that wait for their beginning, at most
 _STILL: Final = 1e-4  # motion smaller than this is neutral
 
 logger = logging.getLogger(__name__)
@@ -79,7 +79,7 @@ class MotionShaper:
             self._limiter = JerkLimiter(JointLimits(low, high, speed, acceleration, jerk), self._period_s)
 
     def start(self, now_s: float) -> Shown:
-        """Return neutral."""
+        """Return the state of an output at neutral."""
         return Shown(
             motion=NEUTRAL,
             phase="neutral",
@@ -91,7 +91,7 @@ class MotionShaper:
         )
 
     def step(self, target: Floats, phase: Phase, now_s: float, shown: Shown) -> Shown:
-        """Return what is shown one period later. `target` (58,): of the phase "live"."""
+        """Return the state one period later. `target` (58,): the motion of the phase "live"."""
         if phase != shown.phase:
             shown = replace(shown, phase=phase, since_s=now_s, origin=shown.motion)
         ahead = shown.motion
@@ -113,14 +113,14 @@ class MotionShaper:
 
 
 class OutputSender:
-    """One output: `step` connects or sends, once a period. `joints`: of `Tick.goals_rad`.
+    """One output: `step` connects or sends, once a period. `joints`: names for `Tick.goals_rad`.
 
     Attributes:
         name: KIND:ADDRESS, in messages and in `why` of a degraded run.
-        lost: the peer is away.
-        shown: what it shows; None while it is not connected.
-        thread: calls `step` with the newest tick, once it is started.
-        closing: set to end the thread: it eases to neutral and disconnects.
+        lost: whether the peer is away.
+        shown: motion that the output shows; None while it is not connected.
+        thread: thread that calls `step` with the newest tick, once it is started.
+        closing: set to end the thread, which then eases to neutral and disconnects.
     """
 
     def __init__(self, output: Output, joints: Sequence[str] = ()) -> None:
@@ -132,7 +132,7 @@ class OutputSender:
         self._pause_s, self._retry_s, self._opened_s = PAUSES_S[0], -np.inf, 0.0
         self._problem: str | None = None
         self._counts = {"frames": 0, "losses": 0}
-        self._window = (0.0, 0, 0.0)  # begins, frames by then, frames a second of the one before
+        self._window = (0.0, 0, 0.0)  # start, frames by then, frames a second of the window before
         self._joints = tuple(joints)
         self._tick: Tick | None = None
         self._events = deque[ListenerEvent](maxlen=_MOST_EVENTS)
@@ -141,7 +141,7 @@ class OutputSender:
 
     @property
     def settled(self) -> bool:
-        """True if nothing is left to ease: it is neutral, held, or away."""
+        """True if nothing is left to ease: the output is neutral, held, or away."""
         shown = self.shown
         return shown is None or shown.phase == "held" or bool(np.abs(shown.motion).max() < _STILL)
 
@@ -149,24 +149,24 @@ class OutputSender:
         """Send a frame, or connect. `frame`: None before the first tick. Never raises; blocks as the output does."""
         frame = frame or OutputFrame(time_s=0.0, motion=NEUTRAL)
         phase: Phase = "neutral" if ending or frame.state in ("starting", "halted") else "live"
-        if frame.state == "halted" and self.output.moves:  # the end of a halted run moves nothing either
+        if frame.state == "halted" and self.output.moves:  # also at the end of a halted run
             phase = "held"
         if self.shown is None and (ending or phase == "held" or now_s < self._retry_s):
-            return  # to connect would move a halted machine
+            return  # connecting would move a halted machine
         try:
             if self.shown is None:
                 self.output.open()
                 self.shown, self._opened_s = self._shaper.start(now_s), now_s
-                self._window = now_s, self._counts["frames"] + 1, 0.0  # the first frame begins it
+                self._window = now_s, self._counts["frames"] + 1, 0.0  # it begins with the first frame
             self.shown = self._shaper.step(frame.motion, phase, now_s, self.shown)
             self.output.send(replace(frame, motion=self.shown.motion), now_s)
-        except Exception as error:  # of a plug-in: any
+        except Exception as error:  # any kind: it may be a plug-in
             self._lose(error, now_s)
         else:
             self._sent(now_s)
 
     def statistics(self) -> Facts:
-        """Return state, peer, frames, frames a second and losses, and what the output counts. From any thread."""
+        """Return state, peer, frames, frames a second and losses, and the output's own figures. From any thread."""
         state = "lost" if self.lost else "connecting" if self.shown is None else "sending"
         return {
             "kind": self.output.kind,
@@ -183,10 +183,10 @@ class OutputSender:
         self._asked(self.output.close)
 
     def _asked(self, method: Callable[[], Facts | None]) -> Facts:
-        """Return what a method of the output gives, nothing where it raises."""
+        """Return the result of a method of the output; empty if it returns none or raises."""
         try:
             return method() or {}
-        except Exception:  # of a plug-in: any
+        except Exception:  # any kind: it may be a plug-in
             logger.info("output %s raised", self.name, exc_info=True)
             return {}
 
@@ -220,7 +220,7 @@ class OutputSender:
         self._tick = seen
 
     def event(self, event: ListenerEvent) -> None:
-        """Take an event that the listener has decided. From any thread."""
+        """Queue an event that the listener has decided. From any thread."""
         self._events.append(event)
 
     def frame(self) -> OutputFrame | None:
@@ -244,7 +244,7 @@ class OutputSender:
         while not self.closing.wait(max(0.0, due_s - time.monotonic())):
             now_s = time.monotonic()
             self.step(self.frame(), now_s)
-            due_s = max(due_s + period_s, now_s + period_s / 2)  # after a late frame the others are not made up for
+            due_s = max(due_s + period_s, now_s + period_s / 2)  # frames missed by a late one are not made up for
         last_s, frame = time.monotonic() + LAST_S, self.frame()
         while not self.settled and (now_s := time.monotonic()) < last_s:
             self.step(frame, now_s, ending=True)
@@ -253,7 +253,7 @@ class OutputSender:
 
 
 class Outputs(Observer):
-    """The outputs of a run. Starts to connect to them all.
+    """All outputs of a run. Its construction starts to connect to them.
 
     Attributes:
         names: KIND:ADDRESS of each.
@@ -275,16 +275,16 @@ class Outputs(Observer):
             each.tick(seen)
 
     def event(self, event: ListenerEvent) -> None:
-        """Take an event that the listener has decided. From any thread."""
+        """Pass an event that the listener has decided to all outputs. From any thread."""
         for each in self.senders:
             each.event(event)
 
     def statistics(self) -> list[Facts]:
-        """Return the figures of each output, as `OutputSender.statistics`."""
+        """Return the figures of each output, as `OutputSender.statistics` does."""
         return [each.statistics() for each in self.senders]
 
     def close(self) -> None:
-        """Lead all outputs to neutral and disconnect them, side by side. Blocks `LAST_S` at most. Idempotent."""
+        """Lead all outputs to neutral and disconnect them, at the same time. Blocks `LAST_S` at most. Idempotent."""
         for each in self.senders:
             each.closing.set()
         until_s = time.monotonic() + LAST_S

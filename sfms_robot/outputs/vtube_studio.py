@@ -4,14 +4,14 @@ JSON requests over ws://HOST:8001 (API 1.0, github.com/DenchiSoft/VTubeStudio), 
 
     AuthenticationTokenRequest   opens a window in VTube Studio; answered when its user clicks Allow or Deny
     AuthenticationRequest        with the token, on every connection
-    InjectParameterDataRequest   each frame; what is not sent again within a second goes back to the tracking
+    InjectParameterDataRequest   each frame; an input that is not sent again within a second returns to the tracking
 
-The token is kept in the user's folder, readable by the user alone. Frames wait for the user's click; then `weight`, or
+The token is kept in the user's folder, readable by the user alone. Frames wait for the user's click. Then `weight`, or
 in the mode "add" the values themselves, grow over a second.
 
 Inputs of an avatar are linear functions of our channels. Signs follow Live2D's (x + to the right of the screen, which
-is the avatar's left; y + up) and VTube Studio's own mapping, which turns EyeLeftX and EyeRightX around. No VTube Studio
-was tried.
+is the avatar's left; y + up) and VTube Studio's own mapping, which reverses EyeLeftX and EyeRightX. It was not tried
+with VTube Studio.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from sfms_robot.ports import Facts, OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 
 PLUGIN: Final = {"pluginName": "sfms-robot", "pluginDeveloper": "sfms-robot"}
-GROW_S: Final = 1.0  # of weight, once access is given
+GROW_S: Final = 1.0  # time in which the weight grows, once access is given
 ANSWER_S: Final = 5.0  # longest wait for an answer, except for the user's
 
 _API: Final = {"apiName": "VTubeStudioPublicAPI", "apiVersion": "1.0"}
-_DENIED, _ASKED_ALREADY, _TAKEN = 50, 51, 454  # of its errors
+_DENIED, _ASKED_ALREADY, _TAKEN = 50, 51, 454  # numbers of its errors
 _DEG: Final = math.degrees(1.0)
 
 # Input of VTube Studio: value of a neutral face, lowest, highest, and the weights of our channels.
@@ -77,7 +77,7 @@ logger = logging.getLogger(__name__)
 
 
 def inputs_of(motion: Floats, added: bool = False) -> dict[str, float]:
-    """Return the inputs of VTube Studio for motion (58,). `added`: what changes against a neutral face."""
+    """Return the inputs of VTube Studio for motion (58,). `added`: as differences from a neutral face."""
     values = np.clip(_NEUTRAL + _WEIGHTS @ motion, _LOW, _HIGH)
     if added:
         values -= _NEUTRAL
@@ -91,14 +91,14 @@ class VtubeStudio(WebSocketOutput):
     mode = "set"
     usual_port = 8001
     absent = "start VTube Studio and switch on the plug-in API in its settings"
-    answers = False  # its silence is judged by its answers
+    answers = False  # it only answers requests; `heard` detects a missing answer
 
     def __init__(self, address: str = "", folder: Path | None = None) -> None:
         super().__init__(address)
         self._file = (folder or user_dir()) / f"vtube_studio_{re.sub(r'[^A-Za-z0-9.-]', '_', self.host)}.token"
         self._denied = self._access = False
-        self._since_s: float | None = None  # of the first frame
-        self._asked_s: float | None = None  # of the oldest request without an answer; None for the user's window
+        self._since_s: float | None = None  # time of the first frame
+        self._asked_s: float | None = None  # time of the oldest unanswered request, apart from that for a token
 
     def greet(self) -> None:
         if self._denied:
@@ -186,7 +186,7 @@ class VtubeStudio(WebSocketOutput):
 
 
 class VtubeStudioAdd(VtubeStudio):
-    """The same inputs added to whatever the streamer's own tracking gives."""
+    """The same inputs, added to those of the streamer's own tracking."""
 
     kind = "vtube-studio-add"
     mode = "add"

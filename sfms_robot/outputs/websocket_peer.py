@@ -1,8 +1,8 @@
-"""Outputs whose peer is a WebSocket server: one connection without a thread, and what all such outputs share.
+"""Outputs whose peer is a WebSocket server: one connection without a thread, and the base class of such outputs.
 
-A peer that is slower than its output costs nothing but frames: a frame is left out while the one before waits for the
-network, and the buffers are small, so that what arrives is new. A peer that takes nothing, or says nothing where it
-should, for `SILENT_S` is lost.
+A peer that is slower than its output only misses frames: a frame is left out while the one before waits for the
+network. The buffers are small, so that the frames that arrive are new. A peer that accepts no data, or sends none where
+it should, for `SILENT_S` is lost.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ CONNECT_S: Final = 1.0
 SILENT_S: Final = 2.0
 GOODBYE_S: Final = 0.3
 _SLICE: Final = 65_536
-_MOST_SLICES: Final = 16  # that are read at a time, of a peer that floods
+_MOST_SLICES: Final = 16  # slices read at a time from a peer that sends too much
 _SEND_BUFFER: Final = 8192  # bytes; the system doubles it
 _SHARE_WINDOW: Final = 250  # frames over which a slow peer is noticed
-_MOST_QUOTED: Final = 40  # characters
+_MOST_QUOTED: Final = 40  # characters of an answer in an error
 
 logger = logging.getLogger(__name__)
 
@@ -45,13 +45,13 @@ class WebSocketPeer:
     """A connection to a WebSocket server. Nothing blocks, except for the constructor and `until`.
 
     Args:
-        path: of the address, "/" and more.
-        absent: what to do where no program listens, for the error.
+        path: path of the address, beginning with "/".
+        absent: advice in the error for an address where no program listens.
 
     Attributes:
-        heard_s: when the last message arrived [s of `time.monotonic`].
-        closed: the peer closed the connection, or is gone; False as long as it may be there.
-        sent, dropped: frames.
+        heard_s: time at which the last message arrived [s of `time.monotonic`].
+        closed: True if the peer closed the connection or is gone; False as long as it may be there.
+        sent, dropped: numbers of frames.
 
     Raises OutputError, as every method does that sends or receives.
     """
@@ -83,7 +83,7 @@ class WebSocketPeer:
             raise
 
     def send(self, message: Message, now_s: float, may_drop: bool = True) -> bool:
-        """Send a message, or leave it out while an older one waits for the network. Return whether it was taken."""
+        """Send a message, or leave it out while an older one waits for the network. Return whether it was accepted."""
         self._exchange()
         if not self._out:
             self._moved_s = now_s
@@ -111,9 +111,9 @@ class WebSocketPeer:
             yield from self.receive()
 
     def close(self) -> None:
-        """Say goodbye, wait `GOODBYE_S` at most for the answer, and close. Idempotent.
+        """Send a close frame, wait `GOODBYE_S` at most for the answer, and close. Idempotent.
 
-        The socket is read until then: closed with unread bytes, it would take back what was sent last.
+        The socket is read until then, because a socket closed with unread bytes discards the data that was sent last.
         """
         until_s = time.monotonic() + GOODBYE_S
         with suppress(OutputError, OSError):
@@ -125,9 +125,9 @@ class WebSocketPeer:
         self._socket.close()
 
     def _exchange(self, wait_s: float = 0.0) -> None:
-        """Write what waits and read what has arrived, waiting up to `wait_s` for the first of it.
+        """Write waiting data and read data that has arrived, waiting up to `wait_s` for the first of it.
 
-        Raises why the connection has ended once all messages before that are taken.
+        After the connection has ended, raises the reason, once all messages before the end are taken.
         """
         if self._end is None:
             try:
@@ -208,14 +208,14 @@ def _parsed(data: bytes) -> Message:
 
 
 class WebSocketOutput(Output):
-    """An output whose peer is a WebSocket server that takes JSON objects.
+    """An output whose peer is a WebSocket server that accepts JSON objects.
 
-    A subclass has `kind`, the attributes below, `greet` and `message`, and `heard` where answers matter.
+    A subclass defines `kind`, the attributes below, `greet` and `message`, and `heard` if answers matter.
 
     Attributes:
-        usual_port, path: of the server.
-        absent: what to do where no program listens, for the error.
-        answers: the peer sends messages all the time; silence is a loss.
+        usual_port, path: usual port and path of the server.
+        absent: advice in the error for an address where no program listens.
+        answers: whether the peer sends messages all the time, so that silence is a loss.
     """
 
     usual_port: int
@@ -227,13 +227,13 @@ class WebSocketOutput(Output):
         self.host, self.port = parse_address(self.kind, address, self.usual_port)
         self.peer = address_text(self.host, self.port)
         self._link: WebSocketPeer | None = None
-        self._dropped = 0  # on connections before
-        self._counts = (0, 0)  # sent and dropped frames when a slow peer was looked for last
+        self._dropped = 0  # frames dropped on earlier connections
+        self._counts = (0, 0)  # sent and dropped frames at the last check for a slow peer
         self._noted = Said()
 
     @property
     def link(self) -> WebSocketPeer:
-        """The connection. Raises OutputError where there is none."""
+        """The connection. Raises OutputError if there is none."""
         if self._link is None:
             raise OutputError("is not connected")
         return self._link
@@ -263,7 +263,7 @@ class WebSocketOutput(Output):
         return {"dropped": self._dropped + (link.dropped if link else 0)}
 
     def close(self) -> None:
-        """Say the last message where the peer is there, and disconnect. Idempotent."""
+        """Send the last message if the peer is still there, and disconnect. Idempotent."""
         if (link := self._link) is None:
             return
         with suppress(OutputError, OSError):
@@ -282,16 +282,16 @@ class WebSocketOutput(Output):
         raise NotImplementedError
 
     def heard(self, messages: Sequence[Message], now_s: float) -> None:
-        """Take the peer's messages. Raises OutputError where they end the connection."""
+        """Process the peer's messages. Raises OutputError if they end the connection."""
 
     def shown(self, frame: OutputFrame, now_s: float) -> None:
-        """Note that a frame was sent."""
+        """Record that a frame was sent."""
 
     def farewell(self) -> None:
         """Send the last message of a connection."""
 
     def say(self, message: Message) -> None:
-        """Send a message that is not left out where the network is slow."""
+        """Send a message that is not left out when the network is slow."""
         self.link.send(message, time.monotonic(), may_drop=False)
 
     def note_once(self, text: str) -> None:

@@ -2,16 +2,16 @@
 
     drives -> range -> knobs -> couplings
 
-in joint units: -1 = min, 0 = rest, +1 = max, or radians from rest. The result depends on the motion alone, so that the
-neutral face is the rest pose whatever came before, and on the knobs, which may differ at every call.
+in joint units: -1 = min, 0 = rest, +1 = max, or radians from rest. The result depends only on the motion and on the
+knobs, which may differ at every call, so that the neutral face is the rest pose regardless of earlier calls.
 
-A value u inside its range, |u| = 1 at the end of it, leaves the knobs as intensity x u x (1 + (style - 1)(1 - |u|)):
-style bends the response without moving its ends, so that small motions come out doubled (2) or vanish (0).
+The knobs turn a value u inside its range, |u| = 1 at its end, into intensity x u x (1 + (style - 1)(1 - |u|)): style
+bends the response without moving its ends, so that small motions are doubled (style 2) or vanish (style 0).
 
 The drives of all joints are one forest, compiled into a few array operations. It is cut into levels, deepest first: all
 leaves are one gather from the motion, and every level above is one `reduceat` per kind of group over its children, then
-dead band, curve, gain, offset and clamp. So the cost does not depend on the form of the file, only a little on the
-depth of the deepest expression; groups of one and sums inside sums are merged first.
+dead band, curve, gain, offset and clamp. The cost therefore does not depend on the form of the file, only a little on
+the depth of the deepest expression. Groups of one and sums inside sums are merged first.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Tree = tuple[int, Expression]  # joint, node
 
 STILL = Expression(channel=CHANNELS[0], gain=0.0)
 _REDUCE = {"sum": np.add, "mean": np.add, "max": np.maximum, "min": np.minimum, "product": np.multiply}
-_PRODUCT_LIMIT = 1e6  # what keeps products of products finite, whatever the motion
+_PRODUCT_LIMIT = 1e6  # limit of a product, which keeps products of products finite for any motion
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ class ChannelMapping:
 
     Attributes:
         joints: names, in the order of the head's file.
-        blind_channels: channels that no drive follows; none of a head without joints, which outputs alone show.
+        blind_channels: channels that no drive follows; empty for a head without joints, which only outputs show.
         dead_joints: joints without a drive.
-        file_knobs: those of the head's file.
+        file_knobs: the knobs of the head's file.
     """
 
     def __init__(self, head: Head) -> None:
@@ -95,7 +95,7 @@ class ChannelMapping:
 
         trees = drives(head)
         self._program = Program.of(list(trees.values()))
-        # Couplings: C sums of joints that may not fall below a bound, and the joints that give way, the first first.
+        # Couplings: C sums of joints that may not fall below a bound, and the joints that give way, in this order.
         self._keep = np.array([[each.keep.get(name, 0.0) for name in self.joints] for each in head.couplings])
         self._at_least = np.array([each.at_least for each in head.couplings])
         self._moving = [[self.joints.index(name) for name in each.moving] for each in head.couplings]
@@ -105,7 +105,7 @@ class ChannelMapping:
         self.file_knobs = self.knobs()
 
     def knobs(self, intensity: Mapping[str, float] | None = None, style: Mapping[str, float] | None = None) -> Knobs:
-        """Return knobs per region over those of the head's file. Raises InputError for an unknown region or value."""
+        """Return the file's knobs with new values by region. Raises InputError for an unknown region or a bad value."""
         values = {"intensity": np.ones(len(self.joints)), "style": np.ones(len(self.joints))}
         for kind, given in (("intensity", intensity or {}), ("style", style or {})):
             for name, value in given.items():
@@ -123,8 +123,8 @@ class ChannelMapping:
     def angles(self, motion: Floats, knobs: Knobs | None = None) -> Doubles:
         """Return angles (J,) or (..., J) [rad] of motion (58,) for all joints, or (..., J, 58) with row j for joint j.
 
-        Without `knobs` those of the head's file hold. Raises ValueError, naming the channel, where the motion is not
-        finite: clipping would hide it.
+        Without `knobs` those of the head's file are used. Raises ValueError, which names the channel, if the motion is
+        not finite, because clipping would hide it.
         """
         if motion.shape[-1:] != (MOTION_DIM,) or (motion.ndim > 1 and motion.shape[-2] != len(self.joints)):
             raise ValueError(f"motion is {motion.shape}, not (58,) or (..., {len(self.joints)}, {MOTION_DIM})")
@@ -168,10 +168,10 @@ class ChannelMapping:
 
 @dataclass(frozen=True)
 class _Curves:
-    """Monotone cubics (PCHIP) of the nodes `where`: C of them with at most K points, evaluated together.
+    """C monotone cubics (PCHIP) of the nodes `where`, with at most K points each, evaluated together.
 
     `breaks` (C, K) is filled up with inf; `pieces` (C, K+1, 4) are coefficients about `origins` (C, K+1), highest
-    power first, the outermost two constant.
+    power first. The two outermost pieces are constant.
     """
 
     where: Indices
@@ -212,10 +212,10 @@ class _Curves:
 
 @dataclass(frozen=True)
 class _Shape:
-    """Operations on the values (..., n) of a level's nodes, without those that change none, to save time in a tick.
+    """Operations on the values (..., n) of a level's nodes; those that change nothing are left out, to save time.
 
     Attributes:
-        gains: (2, n) factors below and above 0, where they differ; else the factor is among the steps.
+        gains: (2, n) factors below and above 0, where they differ; otherwise the factor is among the steps.
         steps: in this order factor, offset, low and high end.
     """
 
@@ -226,7 +226,7 @@ class _Shape:
 
     @classmethod
     def of(cls, nodes: Sequence[Expression]) -> _Shape:
-        count = np.array([float(len(node.mean or (1,))) for node in nodes])  # a mean is a sum, until it is scaled
+        count = np.array([float(len(node.mean or (1,))) for node in nodes])  # a mean is a sum that is scaled here
         dead = np.array([node.dead_band for node in nodes]) * count
         gains = np.array([node.gains for node in nodes]).reshape(-1, 2).T
         gains /= np.where([node.curve is None for node in nodes], count, 1.0)
@@ -258,7 +258,7 @@ class _Shape:
 
 @dataclass(frozen=True)
 class _Level:
-    """Nodes whose children lie side by side one level below, from `starts` on; `kinds`: groups and masks of nodes."""
+    """Nodes whose children are adjacent one level below, from `starts` on; `kinds`: operations and masks of nodes."""
 
     starts: Indices
     kinds: tuple[tuple[np.ufunc, Bools], ...]
@@ -278,7 +278,7 @@ class Program:
 
     Attributes:
         columns: the channel of each leaf.
-        cells: the same in a flattened (J, 58), in the row of the leaf's joint.
+        cells: index of that channel in a flattened (J, 58), in the row of the leaf's joint.
     """
 
     columns: Indices
@@ -288,7 +288,7 @@ class Program:
 
     @classmethod
     def of(cls, trees: Sequence[Expression | None]) -> Program:
-        """Compile plain expressions, without shared ones; None gives 0."""
+        """Compile plain expressions, without shared ones; None has the value 0."""
         forest = [(row, merged(tree) if tree else STILL) for row, tree in enumerate(trees)]
         levels: list[_Level] = []
         for _ in range(max((_depth(tree) for _, tree in forest), default=0)):
@@ -319,14 +319,14 @@ def _level(forest: list[Tree]) -> tuple[_Level, list[Tree]]:
     starts = np.cumsum([0, *(len(group) for group in groups[:-1])])
     ways = [_REDUCE[node.group or "sum"] for _, node in nodes]
     needed = [way for way, group in zip(ways, groups, strict=True) if len(group) > 1] or [np.add]
-    ways = [way if way in needed else needed[0] for way in ways]  # a group of one is the same in every way
+    ways = [way if way in needed else needed[0] for way in ways]  # a group of one has the same value with any operation
     kinds = [(way, np.array([other is way for other in ways])) for way in dict.fromkeys(ways)]
     level = _Level(starts, tuple(kinds), _Shape.of([node for _, node in nodes]))
     return level, [part for group in groups for part in group]
 
 
 def merged(node: Expression) -> Expression:
-    """Return the same function with fewer levels."""
+    """Return an expression of the same function with fewer levels."""
     if node.group is None:
         return node
     parts = [merged(part) for part in node.parts]
@@ -341,12 +341,12 @@ def merged(node: Expression) -> Expression:
 
 
 def _is_linear(node: Expression) -> bool:
-    """Return whether a node is a factor and an offset, before its clamp."""
+    """Return whether a node is only a factor and an offset, before its clamp."""
     return not node.dead_band and node.curve is None and node.gains[0] == node.gains[1]
 
 
 def _terms(part: Expression) -> tuple[Expression, ...]:
-    """Return the terms of a sum that a sum around it can take over; none where it cannot."""
+    """Return the terms of a sum that can be moved into the sum around it; empty if they cannot."""
     if part.sum is None or part.clamp is not None or not _is_linear(part):
         return ()
     gain = part.gains[0]

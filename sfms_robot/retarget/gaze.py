@@ -1,8 +1,8 @@
 """Direction of gaze: the person, looks aside, and eyes that hold a point while the head moves.
 
-`GazeTarget` decides where to look. The aim is a direction in space: to the person's eyes where their place is known,
-else straight ahead, and now and then beside it. It is added to the listener's own motion of head and eyes, so that nods
-and tilts stay, and the listener's own looks aside count among those that people make.
+`GazeTarget` decides where to look. The aim is a direction in space: to the person's eyes if their place is known,
+otherwise straight ahead, and now and then aside. It is added to the listener's own motion of head and eyes, so that
+nods and tilts stay. The listener's own looks aside count toward the number that people make.
 
     place      the median over the last 0.4 s, in the frame of the base: a tracker's noise does not reach the head, and
                the eyes start some 0.2 s after the person, as human eyes do
@@ -12,22 +12,23 @@ and tilts stay, and the listener's own looks aside count among those that people
     gone       two seconds without a face: the head goes back to its middle, slowly, and looks around
 
 Looks aside are measured on 14 people in conversation (Dembinsky et al., ETRA 2024, Apache-2.0, fixations at github
-psyberlab/eye-gaze-during-conversation-dataset e156145): within 5 degrees of the other's face for 95 % of listening and
-60 % of speaking, 7 and 49 shifts of 5 degrees or more a minute. A look aside is two shifts, so it lasts 0.86 and 0.98 s
-in the mean, and a stay near the face 16.3 and 1.47 s. Distances are quantiles (0, 1/4, 1/2, 3/4, 9/10, 1) of those
-beyond 5 degrees; three of four are rather sideways, three of four rather up.
+psyberlab/eye-gaze-during-conversation-dataset e156145): the gaze is within 5 degrees of the other's face for 95 % of
+listening and 60 % of speaking, with 7 and 49 shifts of 5 degrees or more a minute. A look aside is two shifts, so it
+lasts 0.86 and 0.98 s in the mean, and a stay near the face 16.3 and 1.47 s. Distances are quantiles (0, 1/4, 1/2, 3/4,
+9/10, 1) of those beyond 5 degrees. Three of four are more sideways than vertical; three of four go up, not down.
 
-`GazeHold` holds a direction in space: eye + neck_gain x head. While it is held, the eyes take back every degree that
-the head turns (the vestibulo-ocular reflex), so that a nod does not shake the gaze. The head is the one that the neck
-will show, not the requested one: the eyes need not take back a turn that intensity or range removes. The eyes follow
-the listener only when its gaze has really moved: when both its eyes and its direction in space have left the dead zone,
-for a moment. Then they jump, with the duration a human eye takes, and hold again. (Eyes alone would jump at every nod
-of a listener that already turns them against the head; the direction in space alone, at every nod of one that does
-not.) Eyes that compensation has turned too far from the listener's jump back. Lids need no rule: their drives follow
-eyeLookUp and eyeLookDown, which are written here.
+`GazeHold` holds a direction in space: eye + neck_gain x head. While it is held, the eyes compensate for every degree
+that the head turns (the vestibulo-ocular reflex), so that a nod does not shake the gaze. The turn of the head is the
+one that the neck will show, not the requested one, because the eyes need not compensate for a turn that intensity or
+range removes. The eyes follow the listener only when its gaze has really moved: when both its eyes and its direction in
+space have left the dead zone, for a moment. Then they jump, in the time that a human eye takes, and hold again. (If
+only the eyes were compared, they would jump at every nod of a listener that already turns its eyes against the head; if
+only the direction in space, at every nod of a listener that does not.) If compensation has turned the eyes too far from
+those of the listener, they jump back. Lids need no rule: their drives follow eyeLookUp and eyeLookDown, which are
+written here.
 
-Random numbers come from the seed and a counter. Every decision begins at the latest instant of its tick, so that no
-joint, whatever its lead, jumps.
+Random numbers come from the seed and a counter. Every decision takes effect at the latest instant of its tick, so that
+no joint jumps, whatever its lead.
 """
 
 from __future__ import annotations
@@ -48,17 +49,17 @@ from sfms_robot.signals.rotations import rotation
 
 MEDIAN_S: Final = 0.4
 DEAD_ZONE_RAD: Final = math.radians(3.0)
-PAUSE_S: Final = 0.12  # between two jumps
+PAUSE_S: Final = 0.12  # shortest pause between two jumps
 GONE_S: Final = 2.0
-TALKING_S: Final = 0.6  # after the last loud sample: pauses between words are part of talking
+TALKING_S: Final = 0.6  # talking ends this long after the last loud sample: it includes pauses between words
 FARTHEST_RAD: Final = np.radians([70.0, 35.0])  # limit of the direction to a person
-EYES_KEEP_RAD: Final = np.radians([15.0, 10.0])  # the neck takes the rest, as people's does
+EYES_KEEP_RAD: Final = np.radians([15.0, 10.0])  # largest turn of the eyes; the neck makes the rest, as in people
 HEAD_RATE: Final = 9.0  # 1/s
 SLOW_HEAD_RATE: Final = 4.0
-EYELESS_AWAY: Final = 0.5  # of a look aside, for a head that has only its neck to do it with
+EYELESS_AWAY: Final = 0.5  # share of a look aside that a head without eyes makes with its neck
 AWAY_RAD: Final = math.radians(5.0)
 BACK_RAD: Final = math.radians(3.0)
-COUNTED_S: Final = 60.0  # over which the listener's own looks aside are counted
+COUNTED_S: Final = 60.0  # time over which the listener's own looks aside are counted
 _QUANTILES: Final = (0.0, 0.25, 0.5, 0.75, 0.9, 1.0)
 
 
@@ -127,7 +128,7 @@ class Aim:
 
 
 def turned(motion: Floats, aim: Aim) -> Floats:
-    """Return a copy of the motion (N, 58) with the head's part of the aim."""
+    """Return a copy of the motion (N, 58) with the head's part of the aim added."""
     out = motion.copy()
     out[:, YAW_PITCH] += aim.head_rad.astype(np.float32)
     return out
@@ -141,11 +142,11 @@ class AimState:
         gaze: the last jump, in space.
         head, head_before: the turn in force, and the one before it, for earlier instants.
         seen: (time, direction (2,)) to the person over the last 0.4 s, from the base.
-        shown: (time, pose (6,)) of the neck over the last half second, for a camera that goes with it.
-        person_rad: (2,) direction to the person; the last one that left the dead zone.
+        shown: (time, pose (6,)) of the neck over the last half second, for a camera that moves with it.
+        person_rad: (2,) direction to the person; changes only when the person leaves the dead zone around it.
         aside_rad: (2,) the look aside, 0 at the face.
         left: time left of this stay, in mean stays of its kind.
-        listener_hz: the listener's own looks aside; `listener_away` while one lasts.
+        listener_hz: rate of the listener's own looks aside; `listener_away` is True during one.
         draws: number of random draws.
     """
 
@@ -167,8 +168,8 @@ class Camera:
     """Conversion of places (..., 3) [m] from the camera's frame (x out of its lens, y left, z up) to that of the base.
 
     The frame of the head's base has its origin in the middle of the head at home, and stays while the neck moves. A
-    camera on the head goes with `pose` (6,), which the neck shows at that instant, so turning the neck does not move
-    the person; a camera on the base does not use it.
+    camera on the head moves with `pose` (6,), which the neck shows at that instant, so turning the neck does not move
+    the person. For a camera on the base `pose` is not used.
     """
 
     def __init__(self, mount: CameraMount) -> None:
@@ -184,7 +185,7 @@ class Camera:
 
 
 class GazeTarget:
-    """Decision where to look. `gaze` None: a head without eyes; `camera` None: places of people are not known."""
+    """Choice of where to look. `gaze` None: a head without eyes; `camera` None: places of people are not known."""
 
     def __init__(self, config: Person, gaze: Gaze | None, camera: CameraMount | None, seed: int) -> None:
         self.camera = Camera(camera) if camera else None
@@ -193,7 +194,7 @@ class GazeTarget:
         self._neck = gaze is None or gaze.neck_gain > 0
         self._share = 1.0 if gaze is None else config.head_share
         self._often = config.look_away
-        self._seed = seed % 2**63  # numpy takes no negative seed
+        self._seed = seed % 2**63  # numpy accepts no negative seed
 
     def step(
         self, motion: Floats, times_s: Doubles, now_s: float, watched: Watched, state: AimState | None
@@ -215,7 +216,7 @@ class GazeTarget:
         return Aim(state.gaze.at(times_s), head_rad), state
 
     def remember(self, now_s: float, pose: Doubles, state: AimState) -> AimState:
-        """Return the state with the pose (6,) that the neck shows at `now_s`: a camera on it sees from there."""
+        """Return the state with the pose (6,) that the neck shows at `now_s`, from which a camera on the head sees."""
         return replace(state, shown=(*(each for each in state.shown if now_s - each[0] <= 0.5), (now_s, pose)))
 
     def _located(self, watched: Watched, now_s: float, state: AimState) -> AimState:
@@ -236,7 +237,7 @@ class GazeTarget:
         return replace(state, seen=seen, person_rad=median_rad if moved else state.person_rad)
 
     def _counted(self, listener: Floats, dt_s: float, watched: Watched, state: AimState) -> AimState:
-        """Return the state with the listener's own looks aside counted, one row (58,)."""
+        """Return the state after counting a look aside of the listener itself; `listener` (58,) is its motion."""
         looks_rad = listener[YAW_PITCH].astype(np.float64)
         if not self._eyeless:
             looks_rad = looks_rad + directions(listener, self._full_rad).mean(axis=0)
@@ -246,7 +247,7 @@ class GazeTarget:
         return replace(state, listener_hz=hz, listener_away=away)
 
     def _looked_away(self, manner: Manner, now_s: float, by_hand: bool, state: AimState) -> AimState:
-        """Return the state with this tick's look aside, or none."""
+        """Return the state with the look aside of this tick, or without one."""
         away = bool(state.aside_rad.any())
         if by_hand or not self._often:
             return replace(state, aside_rad=np.zeros(2)) if away else state
@@ -261,7 +262,7 @@ class GazeTarget:
         return replace(state, left=self._stay(draws, not away), aside_rad=aside_rad, draws=draws)
 
     def _stay(self, draw: int, away: bool) -> float:
-        """Return the length of the next stay, in mean stays: 1 in the mean."""
+        """Return the length of the next stay, in units of the mean stay: 1 in the mean."""
         rng = np.random.default_rng([self._seed, draw, 1])
         return float(rng.gamma(2.0, 0.5)) if away else 0.1 + 0.9 * float(rng.exponential())
 
@@ -304,8 +305,8 @@ class HoldState:
     """Memory of `GazeHold` between ticks.
 
     Attributes:
-        jump: the last one, in space; its end is the held direction.
-        eyes_rad: (2,) direction of the listener's eyes when it was decided.
+        jump: the last jump, in space; its end is the held direction.
+        eyes_rad: (2,) direction of the listener's eyes when the jump was decided.
         away_since_s: time since which the listener's gaze has been elsewhere.
     """
 
@@ -342,7 +343,7 @@ class GazeHold:
         head_rad = self._head(motion, times_s, shown_pose)
         last = int(np.argmax(times_s))
         state = self._decided(eyes_rad[last], head_rad[last], times_s, state)
-        apart_rad = both_rad - eyes_rad[:, None]  # vergence stays the listener's
+        apart_rad = both_rad - eyes_rad[:, None]  # the listener's vergence is kept
         held_rad = state.jump.at(times_s)
         out = motion.copy()
         if aim is not None:
@@ -354,7 +355,7 @@ class GazeHold:
         return out, state
 
     def _head(self, motion: Floats, times_s: Doubles, shown_pose: ShownPose) -> Doubles:
-        """Return yaw and pitch (N, 2) that the eyes take back. Joints share leads: each instant is solved once."""
+        """Return yaw and pitch (N, 2) that the eyes compensate for. Joints share leads: each instant is solved once."""
         if self._gain == 0:
             pose: Floats | Doubles = motion
         else:
@@ -374,7 +375,7 @@ class GazeHold:
         if not shifted and off_rad <= self._recentre_rad:
             return replace(state, away_since_s=None)
         since_s = now_s if state.away_since_s is None else state.away_since_s
-        spread_s = now_s - float(times_s.min())  # the jump before has to be over at the earliest instant
+        spread_s = now_s - float(times_s.min())  # the last jump has to be over at the earliest instant
         free = now_s - state.jump.end_s >= max(self._pause_s, spread_s)
         if not free or now_s - since_s < self._settle_s - 1e-9:
             return replace(state, away_since_s=since_s)

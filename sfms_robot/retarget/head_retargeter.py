@@ -24,12 +24,12 @@ from sfms_robot.retarget.stewart import Stewart
 Neck = Serial | Stewart
 
 _POSE = len(POSE_CHANNELS)
-_LARGE = np.array([0.5, 0.6, 1.0, 0.05, 0.05, 0.05])  # roll, pitch, yaw [rad], place [m]: style changes nothing there
-_HOME_RAD = np.radians(0.1)  # how far from its rest a joint may stand where the neck is at home
+_LARGE = np.array([0.5, 0.6, 1.0, 0.05, 0.05, 0.05])  # roll, pitch, yaw [rad], place [m]: style has no effect there
+_HOME_RAD = np.radians(0.1)  # largest distance of a joint from its rest with the neck at home
 
 
 def build_neck(config: Kinematics, joints: Mapping[str, Joint]) -> Neck:
-    """Return a head's neck from its section and joints. Raises ConfigError where its home is out of reach."""
+    """Return a head's neck from its section and joints. Raises ConfigError if its home is out of reach."""
     ranges = {name: (joints[name].min_rad, joints[name].max_rad) for name in config.joints()}
     return Serial(config, ranges) if isinstance(config, SerialNeck) else Stewart(config, ranges)
 
@@ -39,11 +39,11 @@ class HeadRetargeter:
 
     Attributes:
         joints: names, in the order of the head's file.
-        neck_columns: places of the neck's joints, in the neck's own order.
+        neck_columns: indices of the neck's joints, in the neck's own order.
         blind_channels: channels that neither the mapping nor the neck shows.
         dead_joints: joints without a drive, outside the neck.
 
-    Raises ConfigError where the neck's home is out of reach, or is not the rest of its joints.
+    Raises ConfigError if the neck's home is out of reach, or is not the rest of its joints.
     """
 
     def __init__(self, head: Head, dt_s: float = 0.01) -> None:
@@ -72,8 +72,8 @@ class HeadRetargeter:
     def step(self, motion: Floats, memory: Doubles, knobs: Knobs | None = None) -> tuple[Doubles, Doubles]:
         """Return angles (J,) for motion (58,) of all joints or (J, 58), row j for joint j, and the next memory.
 
-        The pose is that of the row of the neck's first joint; the knobs of that joint's region turn it. Raises
-        ValueError where the motion is not finite.
+        The pose is that of the row of the neck's first joint; the knobs of that joint's region change it. Raises
+        ValueError if the motion is not finite.
         """
         angles = self.mapping.angles(motion, knobs)
         if self.neck is None:
@@ -82,7 +82,7 @@ class HeadRetargeter:
         return angles, memory
 
     def angles(self, motion: Floats, knobs: Knobs | None = None) -> Doubles:
-        """Return angles as `step`, for a face held for ever, or (..., J, 58) for many faces."""
+        """Return angles as `step` does, for a face that is held for ever, or for many faces (..., J, 58)."""
         angles = self.mapping.angles(motion, knobs)
         if self.neck is not None:
             angles[..., self.neck_columns] = self.neck.solve(self._pose(motion, knobs)).angles_rad
@@ -92,7 +92,7 @@ class HeadRetargeter:
         """Return the poses (..., 6) that the neck shows for motion (..., 58), after the knobs and within its ranges.
 
         Always finite. Without kinematics a channel that no joint follows is 0, the others are unchanged.
-        Raises ValueError where a pose is not finite.
+        Raises ValueError if a pose is not finite.
         """
         if self.neck is None:
             blind = [name in self.blind_channels for name in POSE_CHANNELS]
@@ -106,7 +106,7 @@ class HeadRetargeter:
         """Return the poses (..., 6) of motion (..., 58), changed by the knobs of the neck's region."""
         first, knobs = self.neck_columns[0], knobs or self.mapping.file_knobs
         pose = motion[..., :_POSE].astype(np.float64)
-        if knobs.style[first] != 1.0:  # the same law as of the mapping's joints, over the pose
+        if knobs.style[first] != 1.0:  # the same formula as for the mapping's joints
             pose *= 1.0 + (knobs.style[first] - 1.0) * (1.0 - np.minimum(np.abs(pose) / _LARGE, 1.0))
         pose *= knobs.intensity[first]
         return pose

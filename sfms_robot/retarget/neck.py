@@ -1,9 +1,9 @@
-"""The solution that every neck gives, and a neck of one, two or three axes in series, in closed form.
+"""The result that every neck returns, and a neck of one, two or three axes in series, in closed form.
 
-R = R(first axis) R(second) R(third), from the base to the head. Three axes take any rotation. Two take the rest of it
-when the missing axis is put last and dropped: a pan-tilt neck keeps the direction of the face and loses the roll. One
-takes the turn about it that leaves least. Then each axis goes to its joint, to two joints in series (`shared`), or
-pitch and roll together to a differential. Translation is not for such a neck: all of it is residual.
+R = R(first axis) R(second) R(third), from the base to the head. Three axes reach any rotation. For two axes, the
+missing axis is put last and dropped: a pan-tilt neck keeps the direction of the face and loses the roll. One axis makes
+the turn about it that leaves the smallest rest. Then each axis goes to its joint, to two joints in series (`shared`),
+or pitch and roll together to a differential. Such a neck cannot translate: all translation is residual.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Solved:
         angles_rad: (..., J) in the neck's joint order, always inside the joints' ranges.
         reached: (...) True if these joints give the requested pose.
         shown: (..., 6) the pose that these joints give, always finite; a turn that is reached is equal to the requested
-            one, to the bit.
+            one, bit for bit.
     """
 
     wanted: Doubles
@@ -57,7 +57,7 @@ class Solved:
 
 
 def low_pass(angle_rad: float, before_rad: float, cutoff_hz: float, dt_s: float) -> float:
-    """Return one step of a one-pole low-pass, exact for an angle that holds still during `dt_s`."""
+    """Return one step of a one-pole low-pass, exact for an angle that is constant during `dt_s`."""
     return float(before_rad + (1.0 - np.exp(-2.0 * np.pi * cutoff_hz * dt_s)) * (angle_rad - before_rad))
 
 
@@ -88,8 +88,8 @@ class Serial:
         self._axes = tuple(rotations.AXIS[name] for name in config.order)
         self._range = Range(*np.array([ranges[name] for name in self.joints]).T)
         column = {name: column for column, name in enumerate(self.joints)}
-        self._splits = []  # row of the axis, range and columns of its joints
-        # Angles of the axes (..., k) @ goals = those of the joints (..., J), without their limits; and the reverse.
+        self._splits = []  # row of an axis with two joints, its section, and range and columns of the joints
+        # Angles of the axes (..., k) @ goals = angles of the joints (..., J), without limits; `_turns` is the reverse.
         goals = np.zeros((len(self._axes), len(self.joints)))
         for row, place in enumerate(map(config.axes.get, config.order)):
             if isinstance(place, str):
@@ -109,7 +109,7 @@ class Serial:
     def solve(self, poses: Doubles, body_yaw_rad: Doubles | None = None) -> Solved:
         """Solve poses (..., 6), each held for ever. Without `body_yaw_rad` (...) the neck's own rule turns the body.
 
-        Raises ValueError where a pose is not finite, or a body yaw is given to a neck without one.
+        Raises ValueError if a pose is not finite, or a body yaw is given to a neck without one.
         """
         if body_yaw_rad is not None:
             raise ValueError("this neck has no body yaw")
@@ -143,7 +143,7 @@ class Serial:
     def _axis_angles(self, poses: Doubles) -> Doubles:
         """Return the angle of each axis (..., k) for poses (..., 6), without the limits of the joints."""
         if self._axes in (_POSE_ORDER, _POSE_ORDER[:2]):
-            return poses[..., self._axes]  # the pose is written in these very angles
+            return poses[..., self._axes]  # the pose is written in exactly these angles
         rotation = rotations.rotation(poses[..., :3])
         if len(self._axes) == 1:
             return rotations.twist(rotation, self._axes[0])[..., None]
@@ -152,7 +152,7 @@ class Serial:
         return rotations.euler(rotation, (a, b, c))[..., : len(self._axes)]
 
     def _joint_angles(self, angles: Doubles, slow: Doubles) -> Doubles:
-        """Return joints (..., J) inside their ranges for axis angles and their low-passed ones (..., k)."""
+        """Return joints (..., J) inside their ranges for axis angles and low-passed axis angles (..., k)."""
         out: Doubles = angles @ self._goals
         for row, place, ends, (below, above) in self._splits:
             angle = angles[..., row]
@@ -171,7 +171,7 @@ class Serial:
 def shared(total_rad: Doubles, lower_rad: Doubles, ends: Range) -> tuple[Doubles, Doubles]:
     """Return both joints' angles inside their ranges (2,), from the total (...) and the lower joint's part (...).
 
-    The part beyond the range of one joint goes to the other, so the sum is the total wherever both together can.
+    The part beyond the range of one joint goes to the other, so the sum is the total if both together can reach it.
     """
     (lowest, least), (highest, most) = ends.low, ends.high
     above = np.clip(total_rad - np.clip(lower_rad, lowest, highest), least, most)

@@ -7,8 +7,8 @@ Each channel has a weight: 0 leaves the listener's value, 1 is the requested val
 steps and is 0 again in the end, so that a face without commands is the listener's, bit for bit. A new command begins
 at the present value of the channel.
 
-Commands come from any thread and count from the latest instant of the tick that finds them: joints look ahead by
-different leads, and no instant that was already played is changed.
+Commands come from any thread and take effect at the latest instant of the tick that finds them, because joints look
+ahead by different leads and no instant that was already played may change.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from sfms_robot.signals.gaze_kinematics import direction_to, directions, turn
 from sfms_robot.signals.minimum_jerk import ease
 
 RISE_S: Final = 0.25  # listener -> face
-CHANGE_S: Final = 0.12  # one face asked for -> the next; straight, so that a stream of them flows
+CHANGE_S: Final = 0.12  # one requested face -> the next; linear, so that a stream of faces moves evenly
 FALL_S: Final = 0.35
 EYES_S: Final = 0.1  # a saccade of 30 degrees
 HEAD_S: Final = 0.6  # a head turn that follows it
-HEAD_SHARE: Final = 0.6  # of the direction; the eyes keep the rest
+HEAD_SHARE: Final = 0.6  # share of the direction; the eyes turn the rest
 LARGEST_POSE: Final = np.array([math.pi, math.pi, math.pi, 1.0, 1.0, 1.0])  # rad, m
 _ZERO: Final = np.zeros(1)
 _NEVER_S: Final = np.full(1, -math.inf)
@@ -45,8 +45,9 @@ class Request:
     """Requested values of C channels and their weights; all arrays are (C,), or (1,) before the first command.
 
     Attributes:
-        rise_s, fall_s: of a weight, from `start` at `began_s` up to 1, and down to 0 from `until_s` on.
-        change_s: from the values `before`, which hold until `since_s`, to `after`: by a smooth step, or straight.
+        rise_s, fall_s: time of a weight from `start` at `began_s` up to 1, and down to 0 from `until_s` on.
+        change_s: time of the values from `before`, which hold until `since_s`, to `after`.
+        smooth: whether the values change by a smooth step; otherwise they change linearly.
     """
 
     rise_s: float
@@ -78,7 +79,7 @@ class Request:
         return self.before + share[:, None] * (self.after - self.before)
 
     def then(self, values: Doubles, which: Bools, seconds: float, now_s: float) -> Request:
-        """Return the request with `which` (C,) of `values` (C,) from now on: risen, they stay for `seconds`."""
+        """Return the request for `which` (C,) of `values` (C,) from now on; once risen, they stay for `seconds`."""
         here = np.array([now_s])
         weight, value = self.weights(here)[0], self.values(here)[0]
         falling = which & (self.until_s <= now_s)
@@ -112,8 +113,8 @@ class Puppet:
     """Commands to a face: `show` and `look_at` from any thread; `overlay` from the loop.
 
     Args:
-        gaze: the eyes' range, and the share of the head's turn that they take back.
-        blind: channels that the head does not show; without eyes the head turns all the way, without a neck the eyes.
+        gaze: the eyes' range, and the share of the head's turn that they compensate for.
+        blind: channels that the head does not show; without eyes only the head turns, without a neck only the eyes.
     """
 
     def __init__(self, gaze: Gaze | None = None, blind: frozenset[str] = frozenset()) -> None:

@@ -1,13 +1,13 @@
 """The response of a face's joints, learnt from a camera, and the drives that compensate for it.
 
-A face tracker watches the robot's own face while its joints move. The tracked face goes through the head's own drives:
-that is the value each joint *looks like*, beside the value it *has*. For a servo whose skin moves as its file says they
-are the same. The relation between them is the joint's response,
+A face tracker watches the robot's own face while its joints move. The head's own drives turn the tracked face into the
+value that each joint *looks like*, in contrast to the value that it *has*. For a servo whose skin moves as its file
+says they are the same. The relation between them is the joint's response,
 
-    looks like = offset + r(has),    r(0) = 0, rising, no steeper or flatter than a bound, smooth,
+    looks like = offset + r(has),    r(0) = 0, rising, no steeper or flatter than a bound, smooth.
 
-found by bounded least squares, and read backwards it is the curve to put over the joint's drive. The offset is the
-tracker's own idea of the face at rest, and is left where it is.
+It is found by bounded least squares. Its inverse is the curve to apply to the joint's drive. The offset is what the
+tracker sees in the face at rest, and is not corrected.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ FLATTEST, STEEPEST = 0.2, 8.0  # slope of a response: no curve multiplies a moti
 _KNOTS: Final = 9  # from rest to each end, closer together near rest
 _NEAR_REST: Final = 2.0
 _BINS: Final = 200
-_LEAST_MOVED: Final = 0.2  # of a side's range: less motion than that gives no estimate
+_LEAST_MOVED: Final = 0.2  # share of a side's range; with less motion there is no estimate
 _LEAST_SAMPLES: Final = 50
-_FULL_WEIGHT: Final = 20  # samples in a bin from which on more do not count more
-_SMOOTH: Final = 0.002  # price of a change of slope
-_PLAIN: Final = 0.002  # price of a slope other than 1: decides where there is no data
+_FULL_WEIGHT: Final = 20  # samples in a bin from which on its weight does not grow
+_SMOOTH: Final = 0.002  # weight against a change of slope
+_PLAIN: Final = 0.002  # weight against a slope other than 1: decides where there is no data
 
 
 def looks_like(head: Head, shapes: Floats | Doubles) -> Doubles:
@@ -51,7 +51,7 @@ def asked(head: Head, shapes: Floats | Doubles) -> Doubles:
 
 @dataclass(frozen=True)
 class Response:
-    """The response of one joint: `has` (K,) and `looks` (K,), both rising through 0; `offset` on top.
+    """The response of one joint: `has` (K,) and `looks` (K,), both rising through 0, to which `offset` is added.
 
     `moved`: (lowest, highest) value in the recording.
     """
@@ -74,7 +74,7 @@ class Response:
 def fit(has: Doubles, looks: Doubles, low: Doubles, high: Doubles) -> list[Response | None]:
     """Fit responses to N pairs (N, J) in joint units, in the ranges low..high (J,); None for a joint that hardly moved.
 
-    Raises ValueError where the pairs differ in shape. Rows that are not finite are left out.
+    Raises ValueError if the pairs differ in shape. Rows that are not finite are left out.
     """
     if has.shape != looks.shape or has.ndim != 2:
         raise ValueError(f"has {has.shape} and looks {looks.shape} are not both (N, J)")
@@ -100,7 +100,7 @@ def _response(has: Doubles, looks: Doubles, low: float, high: float) -> Response
     weight = np.sqrt(np.minimum(count, _FULL_WEIGHT) / _FULL_WEIGHT)
     weight /= np.sqrt((weight**2).mean() * len(weight))
     width = np.diff(knots)
-    parts = np.clip((x[:, None] - knots[:-1]) / width, 0.0, 1.0) - (knots[:-1] < 0)  # 0 at rest, of either side
+    parts = np.clip((x[:, None] - knots[:-1]) / width, 0.0, 1.0) - (knots[:-1] < 0)  # 0 at rest, on either side
     # Unknowns are the slope of each piece, then the offset.
     data = np.concatenate([parts * width, np.ones((len(x), 1))], axis=1) * weight[:, None]
     slopes, bends = np.eye(len(width)), np.diff(np.eye(len(width)), axis=0)
@@ -120,7 +120,7 @@ def rms(errors: Doubles) -> float:
 
 
 def fitted_drives(head: Head, responses: Sequence[Response | None]) -> dict[str, Expression]:
-    """Return the drives that compensate for the responses, by joint; a twin of a fitted joint always gets its own."""
+    """Return the drives that compensate for the responses, by joint; a twin of a fitted joint has its own drive."""
     plain = drives(head)
     found: dict[str, Expression] = {}
     for name, response in zip(head.joints, responses, strict=True):
@@ -135,6 +135,6 @@ def fitted_drives(head: Head, responses: Sequence[Response | None]) -> dict[str,
 
 
 def _unfolded(head: Head, name: str, drive: Expression) -> Expression:
-    """Return the drive without the head's folds, which are added to any drive and which this one holds already."""
+    """Return the drive without the head's folds, which are added to every drive and which it already contains."""
     folds = [Expression(channel=fold.channel, gain=-fold.gain) for fold in head.folds if fold.into == name]
     return Expression(sum=(drive, *folds)) if folds else drive

@@ -1,16 +1,16 @@
 """Spontaneous motion of a head, added to the sampled face before it is mapped: sway, gaze, glances and blinks.
 
 `HeadLife` applies the parts in this order, because the eyes hold their point against the idle head motion as well as
-against the listener's, and a glance leaves from the held point. The aim is beside the direction that the listener looks
-in: the hold judges the listener alone.
+against the listener's, and a glance leaves from the held point. The aim is kept apart from the direction in which the
+listener looks, because the hold judges the listener alone.
 
-`IdleFiller` adds blinks, small head motion and glances where the listener gives none. Each kind watches its own
-channels of the listener. Head and glances fade in while those channels are still and fade out four times as fast when
-they move. Blinks are counted: a clock that runs only as far as the listener's rate, over about the last five blinks,
-stays behind the wanted one decides when the next is due. Everything starts as if the listener had given enough.
+`IdleFiller` adds blinks, small head motion and glances where the listener makes none. Each kind watches its own
+channels of the listener. Head motion and glances fade in while those channels are still and fade out four times as fast
+when they move. A clock decides when the next blink is due. It runs only as far as the listener's rate, over about the
+last five blinks, is below the wanted rate. At the start the listener counts as if it had made enough motion.
 
-Head motion is a sum of slow sines, glances and blinks are events that lie at or after the latest instant of a tick, so
-every instant can be evaluated independently, whatever the lead of a joint. Random numbers come from the seed and a
+Head motion is a sum of slow sines. Glances and blinks are events that begin at or after the latest instant of a tick,
+so every instant can be evaluated independently, whatever the lead of a joint. Random numbers come from the seed and a
 counter.
 """
 
@@ -56,8 +56,8 @@ class IdleState:
 
     Attributes:
         now_s, head_rad, eyes_rad: the listener at the tick before, (3,) and (2,).
-        head, eyes: how far each has faded in, 0..1.
-        glance: the last one, relative to the listener's gaze; `glance_s` is when the next is due.
+        head, eyes: how far idle motion of each has faded in, 0..1.
+        glance: the last glance, relative to the listener's gaze; `glance_s`: time at which the next is due.
         draws: number of random draws.
     """
 
@@ -82,7 +82,7 @@ class IdleFiller:
         self._still_rad_s = math.radians(config.still_deg_s)
         self._fade_s = config.fade_s
         self._full_rad = full_rad
-        self._seed = seed % 2**63  # numpy takes no negative seed
+        self._seed = seed % 2**63  # numpy accepts no negative seed
         self._phases = np.random.default_rng([self._seed, 0]).uniform(0, 2 * math.pi, _HZ.shape)
 
     def watch(self, motion: Floats, times_s: Doubles, now_s: float, state: IdleState | None) -> IdleState:
@@ -156,7 +156,7 @@ class IdleFiller:
         return replace(state, blink=blink, draws=draws)
 
     def _until_blink(self, draw: int) -> float:
-        """Return the mean intervals to the next blink: 1 in the mean, never under 0.4."""
+        """Return the time to the next blink in mean intervals: 1 in the mean, never under 0.4."""
         return 0.4 + 0.6 * float(np.random.default_rng([self._seed, draw]).exponential())
 
     def _glanced(self, state: IdleState, times_s: Doubles) -> IdleState:
@@ -166,7 +166,7 @@ class IdleFiller:
         draws = state.draws + 1
         rng = np.random.default_rng([self._seed, draws])
         aside = rng.uniform(-1, 1, 2) * [self._glance_rad, self._glance_rad / 2]
-        target_rad = np.zeros(2) if rng.uniform() < 0.5 else aside  # half the time, back to the other's face
+        target_rad = np.zeros(2) if rng.uniform() < 0.5 else aside  # half of the glances go back to the person's face
         jump = Jump.between(state.glance.end_rad, target_rad, now_s)
         return replace(state, glance=jump, glance_s=now_s + 0.8 + float(rng.exponential(1.8)), draws=draws)
 
@@ -181,9 +181,9 @@ class LifeState:
 
 
 class HeadLife:
-    """Spontaneous motion of one head. Parts that the configuration leaves out do nothing at all.
+    """Spontaneous motion of one head. Parts that the configuration leaves out do nothing.
 
-    `camera`: of the head; None: places of people are not known, and the head looks straight ahead.
+    `camera`: the head's camera; None: places of people are not known, and the head looks straight ahead.
     """
 
     def __init__(self, config: Life, seed: int, camera: CameraMount | None = None) -> None:

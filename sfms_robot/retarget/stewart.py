@@ -6,14 +6,14 @@ sphere where
 
     a = atan2(qy, qx) + s acos(k),    k = (|q|^2 + c^2 - l^2) / (2 c sqrt(qx^2 + qy^2)),
 
-s = +-1 being the side the crank is mounted on. No solution where |k| > 1: the rod is too short or too long.
-q is linear in (R, t), so all legs of many poses are one matrix product. The other way round there is no closed form:
-the six rod lengths are solved for the pose, from one nearby (scipy).
+s = +-1 being the side the crank is mounted on. There is no solution where |k| > 1: the rod is too short or too long.
+q is linear in (R, t), so all legs of many poses are one matrix product. The other direction has no closed form: the six
+rod lengths are solved for the pose, starting from a pose nearby (scipy).
 
-The body takes the yaw beyond the platform's part, or the slow part of it; the platform gets the rest, shrunk toward its
-home where it is out of reach. In reach is a pose that keeps the lean limits of the head, has all cranks inside their
-ranges and off their dead centres, and leaves the head stiff: beyond a pose where the legs leave one direction loose,
-the same cranks would fit but the head could only have fallen there.
+The body takes the yaw beyond the platform's part, or the slow part of it. The platform gets the rest, shrunk toward its
+home where it is out of reach. A pose is in reach if it keeps the lean limits of the head, has all cranks inside their
+ranges and off their dead centres, and leaves the head stiff. Beyond a pose where the legs leave one direction loose,
+the same crank angles would fit, but the head could only get there by falling.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from sfms_robot.ranges import Range
 from sfms_robot.retarget.neck import Ranges, Solved, checked, low_pass
 from sfms_robot.signals import rotations
 
-TOLERANCE: Final = 1e-14  # of a pose that is searched for
+TOLERANCE: Final = 1e-14  # tolerance of the search for a pose
 ARRIVED_M: Final = 1e-12  # error of the rods' lengths
 FOLLOW_RAD: Final = 0.25  # the most that a crank turns between two poses of a search
 MIN_STIFFNESS: Final = 0.02  # share of the stiffness (determinant) at home
 DEAD_CENTRE: Final = 0.999  # a crank turns at most some 22 times as fast as in the middle of its stroke
-ROUNDING_RAD: Final = 1e-9  # so that a pose right at a limit is still within it, seen from a turned body
+ROUNDING_RAD: Final = 1e-9  # slack, so that a pose exactly at a limit is within it, seen from a turned body
 HOME: Final = np.zeros(6)
-BLOCK: Final = 500  # poses at a time, for the memory that their pieces take
+BLOCK: Final = 500  # poses at a time, to limit the memory for their pieces
 PIECES: Final = 32
 PASSES: Final = 6  # to a billionth of the way: 32 ** 6 = 2 ** 30
 
@@ -47,8 +47,8 @@ class Platform:
     """Geometry of six legs, poses seen from the body that carries the servos.
 
     Attributes:
-        linear: (18, 12) from R row by row and t to the rod ends in the servos' frames, leg by leg.
-        constant: (18,) the same of the home pose's height and the servos' places.
+        linear: (18, 12) matrix from R row by row and t to the rod ends in the servos' frames, leg by leg.
+        constant: (18,) the rod ends' constant part, from the home pose's height and the servos' places.
         turn: (6, 3, 3) rotation body -> servo.
         rod_arms_m: (6, 3) rod ends in the head's frame.
         side: (6,) branch sign s.
@@ -88,8 +88,8 @@ class Platform:
     def inverse(self, poses: Doubles, dead_centre: float = 1.0) -> Doubles:
         """Return crank angles (..., 6) [rad] within -pi..pi of poses (..., 6); NaN for a leg that does not reach.
 
-        At |k| = 1 crank and rod lie in line and the crank turns ever faster with the head: a `dead_centre` below 1
-        keeps away from there.
+        Toward |k| = 1, where crank and rod lie in line, the crank turns ever faster with the head. A `dead_centre`
+        below 1 excludes these poses.
         """
         q = self.rod_ends_m(rotations.rotation(poses[..., :3]), poses[..., 3:])
         flat = np.hypot(q[..., 0], q[..., 1])
@@ -98,10 +98,10 @@ class Platform:
         return rotations.wrapped(np.arctan2(q[..., 1], q[..., 0]) + self.side * turn)
 
     def forward(self, angles_rad: Doubles, start: Doubles) -> Doubles:
-        """Return the poses (..., 6) of crank angles (..., 6), from a pose (..., 6) nearby: the last one, or home.
+        """Return the poses (..., 6) of crank angles (..., 6); `start` (..., 6): a pose nearby, the last one or home.
 
-        A row is NaN where its angles are not finite, no pose has them, or `start` is not a pose of this platform. Takes
-        a millisecond a pose.
+        A row is NaN if its angles are not finite, no pose has them, or `start` is not a pose of this platform. Takes a
+        millisecond per pose.
         """
         begin, out = np.broadcast_to(start, angles_rad.shape), np.full(angles_rad.shape, np.nan)
         for row in np.ndindex(angles_rad.shape[:-1]):
@@ -111,8 +111,8 @@ class Platform:
     def _pose(self, angles: Doubles, begin: Doubles) -> Doubles:
         """Return the pose (6,) of crank angles (6,).
 
-        Several poses fit the same cranks: the search follows the cranks from `begin` in small steps, and ends where it
-        passes a pose with a loose direction.
+        Several poses fit the same cranks. The search therefore follows the cranks from `begin` in small steps. The
+        result is NaN if it passed a pose with a loose direction.
         """
         from scipy.optimize import root  # only pictures of a head need it
 
@@ -135,7 +135,7 @@ class Platform:
     def stiffness(self, poses: Doubles, angles_rad: Doubles) -> Doubles:
         """Return the determinant (...) of rod lengths against motion of the head; 0 for a head with a loose direction.
 
-        Beyond 0, with the other sign, lie poses that these cranks also fit but can only reach by falling through.
+        Poses beyond, with the other sign, also fit these cranks, but the head can reach them only by falling through.
         """
         rotation = rotations.rotation(poses[..., :3])
         # The change of the rods' lengths with a rotation vector w, then a shift, of the head: (w x arm) . pull =
@@ -177,7 +177,7 @@ class Stewart:
         return self._body is not None
 
     def reachable(self, poses: Doubles) -> Bools:
-        """Return True (n,) for the poses (n, 6), seen from the body, that the platform can take."""
+        """Return True (n,) for the poses (n, 6), seen from the body, that the platform can reach."""
         cranks = self.geometry.inverse(poses, DEAD_CENTRE)
         fine = np.asarray(self._range.holds(cranks).all(axis=-1) & (np.abs(poses) <= self._lean).all(axis=-1))
         fine[fine] = self.geometry.stiffness(poses[fine], cranks[fine]) / self._home_stiffness >= MIN_STIFFNESS
@@ -208,7 +208,7 @@ class Stewart:
         return rotations.seen_from(-body, self.geometry.forward(angles_rad[..., -6:], rotations.seen_from(body, start)))
 
     def _body_yaw(self, yaw_rad: Doubles, slow_rad: Doubles) -> Doubles:
-        """Return the body's part (...) of the yaw (...): the slow one, and always the part beyond the platform's."""
+        """Return the body's part (...) of the yaw (...): the slow part, and always what exceeds the platform's part."""
         if self._body is None:
             return np.zeros_like(yaw_rad)
         beyond = np.radians(self._body.beyond_deg)
@@ -219,7 +219,7 @@ class Stewart:
         shape = poses.shape[:-1]
         wanted = rotations.seen_from(body, poses).reshape(-1, 6)
         given, reached = self.nearest(wanted)
-        # A border pose may round past its end.
+        # By rounding, a crank may exceed its range at a border pose.
         angles = self._range.nearest(self.geometry.inverse(given)).reshape(*shape, 6)
         if self.turns_body:
             angles = np.concatenate([np.broadcast_to(body, shape)[..., None], angles], axis=-1)
@@ -234,8 +234,8 @@ class Stewart:
         y, z) the border is the first place where the reach ends; it is found by cutting the line into pieces and
         keeping the first one that leaves. The answer depends on the wanted pose alone and changes continuously with it
         as long as the reach is star-shaped about home, so a pose that moves smoothly in and out of reach gives a smooth
-        one, with nothing to remember. A pose in reach comes back unchanged, even where the line to it leaves the reach
-        for a while.
+        one, without any memory. A pose in reach is returned unchanged, even where the line to it leaves the reach for a
+        while.
         """
         reached = self.reachable(poses)
         out = poses.copy()
@@ -246,7 +246,7 @@ class Stewart:
         return out, reached
 
     def _share(self, poses: Doubles) -> Doubles:
-        """Return the share (n,) of each pose (n, 6) lies before the border, 0..1."""
+        """Return the share (n,) of each pose (n, 6) that lies before the border, 0..1."""
         start, width = np.zeros(len(poses)), 1.0
         ends = np.arange(1, PIECES + 1) / PIECES
         for _ in range(PASSES):

@@ -1,7 +1,7 @@
-"""Loop time, seconds from 0, real or virtual; the ticks in it; and a listener that is stepped in virtual time.
+"""Clocks of the loop, real and virtual, in seconds from 0; its ticks; and a listener that is stepped in virtual time.
 
-A tick has an absolute deadline, so work never makes the rate drift. A tick that starts late is counted; ticks that were
-missed altogether are skipped, never chased: catching up would mean moving the head faster.
+A tick has an absolute deadline, so work never makes the rate drift. A tick that starts late is counted. Ticks that were
+missed altogether are skipped and never made up for, because catching up would mean moving the head faster.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from sfms_robot.frames import Plan, SpeakerFrame
 from sfms_robot.ports import Clock, Facts, Listener
 
 FAST_LATENCY_S: Final = 0.010  # in virtual time a plan becomes visible this long after its last speaker frame
-BUSY_S: Final = 0.04  # a tick that is this late shows: a frame of the face
-SHOWN_S: Final = 2.0  # after its last late tick an incident is over
+BUSY_S: Final = 0.04  # smallest lateness that is reported: one frame of the face
+SHOWN_S: Final = 2.0  # an incident is over this long after its last late tick
 LOGGED_EVERY_S: Final = 60.0
 log = logging.getLogger(__name__)
 
-_SAME: Final = 1e-6  # of a period: a clock this close to a tick is at it
-# Statistics of a feed whose steps have no duration and that leaves nothing out.
+_SAME: Final = 1e-6  # share of a period: a clock this close to a tick counts as being at it
+# Statistics of a feed whose steps have no duration and that skips no frame.
 IDLE_FEED: Final[Facts] = {
     "state": "listening", "restarts": 0, "skipped_frames": 0, "step_ms": {"p50": None, "p99": None},
 }  # fmt: skip
@@ -45,7 +45,7 @@ class RealClock:
 
 
 class VirtualClock:
-    """Time that advances only when it is waited for."""
+    """Clock whose time advances only in `wait_until`."""
 
     origin_s = 0.0
 
@@ -69,9 +69,9 @@ class TickTime:
 
 
 def tick_times(clock: Clock, rate_hz: float, start_s: float) -> Iterator[TickTime]:
-    """Yield endless ticks from now on, at `rate_hz`; nominal times are exact multiples of the period since `start_s`.
+    """Yield ticks at `rate_hz` without end; nominal times are exact multiples of the period since `start_s`.
 
-    Blocks until each is due.
+    Blocks until each tick is due.
     """
     index = max(0, math.ceil((clock.now_s() - start_s) * rate_hz - _SAME))
     while True:
@@ -85,10 +85,10 @@ def tick_times(clock: Clock, rate_hz: float, start_s: float) -> Iterator[TickTim
 
 
 class TickPace:
-    """A judge of the loop's lateness: late ticks close together are one incident, with a log line and a name.
+    """Detector of late ticks: those close together are one incident, with a log message and a text.
 
     Attributes:
-        busy: what the page shows during an incident; None: there is none.
+        busy: text that the page shows during an incident; None without one.
     """
 
     def __init__(self) -> None:
@@ -98,7 +98,7 @@ class TickPace:
         self._unlogged = 0
 
     def judge(self, time_s: float, late_s: float, worked_s: float) -> None:
-        """Judge a tick that began `late_s` behind; the loop computed for `worked_s` in the tick before it."""
+        """Judge a tick that began `late_s` after its deadline; the loop computed for `worked_s` in the tick before."""
         if late_s < BUSY_S:
             if self.busy is not None and time_s - self._last_s > SHOWN_S:
                 self.busy, self._worst_s = None, 0.0
@@ -117,7 +117,7 @@ class TickPace:
 
 
 class InlineFeed:
-    """A `ports.PlanFeed` that steps the listener in `push`, so that every run of one seed is the same run.
+    """A `ports.PlanFeed` that steps the listener in `push`, so that runs with the same seed are identical.
 
     A plan becomes visible `FAST_LATENCY_S` after its frame. `engine`: name of the listener's engine for the report.
     """

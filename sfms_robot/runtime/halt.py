@@ -3,15 +3,16 @@
     close      from its next tick on the loop brakes every joint as fast as its limits allow, then holds or releases it
     resume     clears the causes that its door may clear; refused while a switch is still on
 
-A door is the place that the request comes from: the device itself, the page or the fleet. A cause is cleared at the
-door that it names, or at the device. The table of causes is in docs/safety.md. A loop that does not answer within
-`ANSWER_S` is dead: torque goes off at once, from the thread that waits for the answer. The lock is held for assignments
-only, never while anything is logged, read or sent.
+A door is the place that the request comes from: the device itself, the page or the fleet. A cause can be cleared from
+the door that it names, or from the device. The table of causes is in docs/safety.md. If the loop does not answer within
+`ANSWER_S`, the thread that waits for the answer switches torque off at once. The lock is held for assignments only,
+never while anything is logged, read or sent.
 
 Switches outside the program are a signal, a file that appears, and a line of a GPIO chip. A button of a GPIO line is
-wired to ground: the line's own pull-up holds it high, and pressing it closes the latch. With `active-high` a line that
-rises does. Linux only: the chip is `/dev/gpiochipN`, by its character device (kernel 5.10 and later; structures of
-<linux/gpio.h>, version 2). A file or line that is on keeps the latch closed. One that cannot be read counts as on.
+wired to ground: the line's own pull-up holds it high, and pressing it closes the latch. With `active-high` a rising
+line closes the latch. GPIO works on Linux only: the chip is the character device `/dev/gpiochipN` (kernel 5.10 and
+later; structures of <linux/gpio.h>, version 2). A file or line that is on keeps the latch closed. A file or line that
+cannot be read counts as on.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ from sfms_robot.processes import start_thread
 Door = Literal["device", "page", "fleet"]
 
 ANSWER_S: Final = 0.1  # ten ticks at 100 Hz
-MOST_CAUSES: Final = 16  # kept by name: clients of a network choose names
-JOIN_S: Final = 1.0  # for a thread whose log is held up
+MOST_CAUSES: Final = 16  # causes kept by name; limited because clients of a network choose the names
+JOIN_S: Final = 1.0  # longest wait for a thread that is blocked in logging
 FILE_PERIOD_S: Final = 0.05
 
 _GET_LINE: Final = 0xC250B407  # _IOWR(0xB4, 0x07, struct gpio_v2_line_request)
@@ -70,7 +71,7 @@ class HaltLatch:
         self.causes: tuple[str, ...] = ()
         self.switches: dict[str, Callable[[], bool]] = {}
         self._changed = threading.Condition()
-        self._closed: dict[tuple[str, Door], int] = {}  # by cause and door, its newest closing
+        self._closed: dict[tuple[str, Door], int] = {}  # (cause, door) -> number of its newest closing
         self._closings = 0
         self._answered = self._late = self._over = False
 
@@ -80,7 +81,7 @@ class HaltLatch:
         return ", ".join(self.causes) or None
 
     def close(self, cause: str, cleared_by: Door = "device") -> None:
-        """Halt. A cause that is present already is renewed: a resume that has begun does not clear it."""
+        """Close the latch. A cause that is present already is renewed: a resume in progress does not clear it."""
         key = cause, cleared_by
         with self._changed:
             if key not in self._closed:
@@ -94,8 +95,8 @@ class HaltLatch:
     def resume(self, door: Door) -> None:
         """Clear the causes that `door` may clear (the device: all); the halt ends when no cause is left.
 
-        Raises HaltedError, in one line that names the causes: with nothing cleared while a switch is still on or torque
-        is being taken off; else for the remaining causes.
+        Raises HaltedError, in one line that names the causes. While a switch is still on, or torque is being taken off,
+        nothing is cleared. Otherwise the error names the remaining causes.
         """
         with self._changed:
             before = dict(self._closed)
@@ -127,7 +128,7 @@ class HaltLatch:
 
     @contextmanager
     def watched(self, bus: Bus) -> Iterator[None]:
-        """Take torque off when the loop does not answer in time, while inside."""
+        """Switch torque off if the loop does not answer in time, while the context is active."""
         thread = start_thread(self._watch, "halt", bus)
         try:
             yield
@@ -160,9 +161,10 @@ class HaltLatch:
 
 @contextmanager
 def halt_signals(latch: HaltLatch) -> Iterator[None]:
-    """Close the latch on SIGUSR1 and resume on SIGUSR2, while inside. Main thread only; does nothing on Windows.
+    """Close the latch on SIGUSR1 and resume on SIGUSR2, while the context is active.
 
-    The handlers only wake a thread each, so that neither a lock nor a log that is held up stops the main thread.
+    Main thread only; does nothing on Windows. Each handler only wakes a thread, so that neither a lock nor blocked
+    logging stops the main thread.
     """
     if not hasattr(signal, "SIGUSR1"):
         yield
@@ -175,7 +177,7 @@ def halt_signals(latch: HaltLatch) -> Iterator[None]:
 
 
 def resume_here(latch: HaltLatch) -> None:
-    """Resume at the device; log a refusal."""
+    """Resume from the device, and log a refusal."""
     try:
         latch.resume("device")
     except HaltedError as refusal:
@@ -184,7 +186,7 @@ def resume_here(latch: HaltLatch) -> None:
 
 @contextmanager
 def _on_signal(number: int, act: Callable[[], None]) -> Iterator[None]:
-    """Call `act` in a thread for every signal, while inside."""
+    """Call `act` in a thread for every signal, while the context is active."""
     came = SimpleQueue[bool]()  # reentrant: a handler may interrupt any code
 
     def work() -> None:
@@ -202,9 +204,10 @@ def _on_signal(number: int, act: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def halt_switch(where: str, latch: HaltLatch) -> Iterator[None]:
-    """Close the latch by `--halt-on FILE` or `--halt-on /dev/gpiochipN:LINE[,active-high]`, while inside.
+    """Watch the switch of `--halt-on FILE` or `--halt-on /dev/gpiochipN:LINE[,active-high]`.
 
-    A thread waits for it. Raises ConfigError for a place that cannot be watched, and for a switch that is on already.
+    While the context is active, a thread waits for the switch, which closes the latch. Raises ConfigError for a file or
+    line that cannot be watched, and for a switch that is on already.
     """
     if (line := _LINE.fullmatch(where)) is not None:
         with watching_line(open_line(line["chip"], int(line["line"]), line["high"] is None), where, latch):
@@ -223,7 +226,7 @@ def halt_switch(where: str, latch: HaltLatch) -> Iterator[None]:
 
 
 def _is_there(path: Path) -> bool:
-    """Return whether the file exists; a folder that cannot be read counts."""
+    """Return whether the file exists; True also if its folder cannot be read."""
     try:
         path.stat()
     except FileNotFoundError:
@@ -235,7 +238,7 @@ def _is_there(path: Path) -> bool:
 
 @contextmanager
 def watching_line(line: GpioLine, name: str, latch: HaltLatch) -> Iterator[None]:
-    """Close the latch when `line` becomes active, while inside; give the line back at the end."""
+    """Close the latch when `line` becomes active, while the context is active; release the line at the end."""
     try:
         with _watching(name, latch, line.active, line.pressed, line.fd):
             yield
@@ -249,9 +252,9 @@ def _watching(
 ) -> Iterator[None]:
     """Close the latch from a thread each time `pressed` returns true: when `fd` has an event, or periodically.
 
-    `active` is called before every resume. A switch that cannot be read closes the latch, and nothing opens it again.
+    `active` is called before every resume. A switch that cannot be read closes the latch, which then stays closed.
     """
-    ours, theirs = socket.socketpair()  # readable once it is over; Windows waits for no pipe
+    ours, theirs = socket.socketpair()  # `ours` is readable at the end; on Windows `select` accepts no pipe
     watched: list[Any] = [ours] if fd is None else [ours, fd]
     period_s = FILE_PERIOD_S if fd is None else None
 
@@ -284,7 +287,7 @@ class GpioLine:
     ioctl: Ioctl
 
     def active(self) -> bool:
-        """Read its level; a line that cannot be read counts as active."""
+        """Return whether the line is active; True if it cannot be read."""
         values = bytearray(_VALUES.pack(0, 1))
         try:
             self.ioctl(self.fd, _GET_VALUES, values)
@@ -293,7 +296,7 @@ class GpioLine:
         return bool(_VALUES.unpack(values)[0] & 1)
 
     def pressed(self) -> bool:
-        """Read one edge and the level: whether it became active, however shortly, or is. Raises OSError."""
+        """Read one edge; return whether the line became active, however shortly, or is active. Raises OSError."""
         event = os.read(self.fd, _EVENT.size)
         if len(event) != _EVENT.size:
             raise OSError("the line has no events any more")
@@ -301,7 +304,7 @@ class GpioLine:
 
 
 def open_line(chip: str, line: int, active_low: bool = True, ioctl: Ioctl | None = None) -> GpioLine:
-    """Return a line of a chip as input with its pull-up.
+    """Open a line of a chip as input, with its pull-up if `active_low`.
 
     Raises ConfigError for a chip or line that cannot be used, and for a line that is active already.
     """

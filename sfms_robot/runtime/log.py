@@ -1,7 +1,7 @@
 """Measurements of a run. Every figure of the report comes from here or from the parts' own counters.
 
-Memory is bounded for runs of days: running figures, quantiles in fixed memory and the last half minute of three
-channels.
+Memory is bounded, so that a run may take days: running figures, quantiles in fixed memory and the last half minute of
+three signals of the face.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from sfms_robot.signals.events import MOTION_EVENTS
 from sfms_robot.signals.quantiles import Quantiles
 
 LATE_SHARE: Final = 0.5  # a tick is late when it starts more than this share of a period behind its deadline
-ATTENTIVE: Final = 0.5  # a person with more attention looks at the head
+ATTENTIVE: Final = 0.5  # a person with more attention than this counts as looking at the head
 SPEECH_RMS: Final = 0.01  # a frame louder than this counts as speech when latency is measured
-STATES: Final = 200  # newest changes of state in the report
-_REMEMBERED: Final = 250  # frames of speech and plans that wait to be measured: ten seconds
-_BLOCK_S: Final = 20.0  # counted at once
+STATES: Final = 200  # changes of state in the report, the newest ones
+_REMEMBERED: Final = 250  # longest queue of speech frames (ten seconds), and of plans, that wait to be measured
+_BLOCK_S: Final = 20.0  # length of a block, whose events are counted at once
 _MARGIN_S: Final = 8.0  # searched on both sides of a block; no nod is longer
 
 logger = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ class EventCounter:
 
     Args:
         find: signal (N,) and its rate -> events (start_s, end_s, size) in order, as those of `signals.events`.
-        worker: where blocks are counted; a block takes milliseconds, which no tick has to spare.
+        worker: executor that counts the blocks; a block takes milliseconds, too long for a tick.
 
     Blocks overlap, and an event counts in the block that it starts in, so the count is that of the whole signal.
     """
@@ -49,16 +49,16 @@ class EventCounter:
         self._find, self._rate_hz, self._worker = find, rate_hz, worker
         self._block, self._margin = round(_BLOCK_S * rate_hz), round(_MARGIN_S * rate_hz)
         self._values: list[float] = []
-        self._before = 0  # values of the block before, at the front
-        self._counted = 0  # events of whole blocks; belongs to the worker
+        self._before = 0  # leading values, which belong to the block before
+        self._counted = 0  # events of whole blocks; used by the worker
         self._search: Future[int] | None = None
-        self._whole: Future[int] | None = None  # the count of the block before
+        self._whole: Future[int] | None = None  # count up to the end of the block before
         self._wanted = False
         self._so_far = 0
 
     @property
     def so_far(self) -> int:
-        """Events as of the newest search of the unfinished block; requests another. From any thread; never blocks."""
+        """Events up to the newest search of the unfinished block; requests another. From any thread; never blocks."""
         self._wanted = True
         return self._so_far
 
@@ -70,7 +70,7 @@ class EventCounter:
         last = self._before + self._block
         if len(self._values) >= last + self._margin:
             if self._whole is not None:
-                self._whole.result()  # in real time it has had twenty seconds
+                self._whole.result()  # does not block in real time: it had twenty seconds
             self._whole = self._submit(last, whole=True)
             self._values, self._before = self._values[last - self._margin :], self._margin
 
@@ -82,13 +82,13 @@ class EventCounter:
         block = (np.array(self._values), self._before, last, whole)
         try:
             return self._worker.submit(self._count, *block)
-        except RuntimeError:  # the interpreter ends, and with it the worker, while the head comes to rest
+        except RuntimeError:  # the interpreter shuts down, and the worker with it, while the head comes to rest
             found = Future[int]()
             found.set_result(self._count(*block))
             return found
 
     def _count(self, values: Doubles, first: int, last: int, whole: bool) -> int:
-        """Search a block, in the worker, which has counted the blocks before; return the events so far."""
+        """Search a block and return the events so far. Runs in the worker, after the blocks before."""
         starts = [max(0, round(start_s * self._rate_hz)) for start_s, _, _ in self._find(values, self._rate_hz)]
         self._so_far = self._counted + sum(first <= start < last for start in starts)
         if whole:
@@ -97,9 +97,9 @@ class EventCounter:
 
 
 class RunLog:
-    """Figures filled by the loop and read at the end; quantiles, and `so_far` of `counters`, also by other threads.
+    """Figures that the loop records and that are read at the end.
 
-    `period_s`: of a tick.
+    Other threads may read the quantiles, and `so_far` of `counters`. `period_s`: period of a tick.
     """
 
     def __init__(self, joints: Sequence[str], period_s: float, audit: CommandAudit) -> None:
@@ -107,26 +107,26 @@ class RunLog:
         self.pace = TickPace()
         self.ticks = self.late = self.skipped = self.eased = self.refused_plans = 0
         self.frames = 0
-        self.judged_frames = 0  # whose attention is known
+        self.judged_frames = 0  # frames with known attention
         self.attentive_frames = 0
         self.late_ms, self.frame_to_wire_ms, self.speech_to_wire_ms = Quantiles(), Quantiles(), Quantiles()
         self.listened_s = 0.0
         self.audited: Any = None  # the state of the audit
-        self.state: Any = None  # of the loop at its end, with the counters of timeline and limiter
-        self.torque_unconfirmed: list[str] = []  # joints that came on and are not confirmed off
+        self.state: Any = None  # last state of the loop, with the counters of timeline and limiter
+        self.torque_unconfirmed: list[str] = []  # joints whose torque came on and is not confirmed off
         self.detached: Mapping[str, str] = {}  # observers that raised
         self.reported: Sequence[str] = ()  # lost parts that log their own loss
         self.states = deque[tuple[float, RunState]](maxlen=STATES)
         self.state_s = defaultdict[str, float](float)
-        self._low_rad = np.full(len(joints), np.inf)  # (J,), as the two below
+        self._low_rad = np.full(len(joints), np.inf)  # (J,), as the next two
         self._high_rad = -self._low_rad
         self._travel_rad = np.zeros(len(joints))
         self._last_rad: Doubles | None = None
-        self._worked_s = 0.0  # by the loop's thread so far
+        self._worked_s = 0.0  # processor time of the loop's thread so far
         self._waiting = deque[Plan](maxlen=_REMEMBERED)
         self._speech_s = deque[float](maxlen=_REMEMBERED)
         worker = ThreadPoolExecutor(1, "event counter")
-        worker.submit(int).result()  # its thread begins now, before the loop's takes real-time priority
+        worker.submit(int).result()  # start its thread before the loop's thread gets real-time priority
         rate_hz = 1.0 / period_s
         self.counters = {name: EventCounter(kind.find, rate_hz, worker) for name, kind in MOTION_EVENTS.items()}
 
@@ -156,7 +156,7 @@ class RunLog:
             if last.name == "halted" and state.name == "starting":
                 logger.info("halt released")
         self.states.append((now_s, state))
-        reported = {"listener", *self.joints, *self.reported}  # each by a line of its own, which has the reason
+        reported = {"listener", *self.joints, *self.reported}  # each of these logs its own line, with the reason
         level = logging.WARNING if set(state.why) - reported - set(before) else logging.INFO
         logger.log(level, "%s%s", state.name, f": {', '.join(state.why)}" if state.why else "")
 
@@ -171,7 +171,7 @@ class RunLog:
     def commanded(self, tick: TickTime, goals_rad: Doubles, asked_rad: Doubles, motion: Floats | None = None) -> None:
         """Record the goals (J,) of the limiter for a reference (J,), sent or not.
 
-        `motion`: the face (58,) behind it; None on the way to rest.
+        `motion`: the face (58,) that the reference shows; None on the way to rest.
         """
         late_s = tick.late_s + tick.skipped * self.period_s
         self.ticks += 1
@@ -194,7 +194,7 @@ class RunLog:
             self.counters[name].add(float(kind.signal(motion)))
 
     def wrote(self, wire_s: float, reach_s: float) -> None:
-        """Record a command on the wire at `wire_s`, which played the timeline up to `reach_s`."""
+        """Record that a command was on the wire at `wire_s`; it played the timeline up to `reach_s`."""
         while self._waiting and self._waiting[0].times_s[0] <= reach_s:
             made_at_s = self._waiting.popleft().made_at_s
             self.frame_to_wire_ms.add(max(0.0, wire_s - made_at_s) * 1e3)
@@ -208,7 +208,7 @@ class RunLog:
         return {"share": share, "frames": self.judged_frames}
 
     def joint_report(self) -> dict[str, dict[str, float]]:
-        """Return `joints` of the report: range and travelled way of every goal stream."""
+        """Return `joints` of the report: range of the goals of every joint, and the way that they travelled."""
         if self._last_rad is None:
             return {}
         ways = np.stack([self._low_rad, self._high_rad, self._travel_rad], axis=1).round(5).tolist()

@@ -2,11 +2,11 @@
 
     source -> listener -> timeline -> retarget -> limits -> bus -> observers
 
-One tick every 1/rate_hz s on absolute deadlines. All that changes during a run is a `LoopState` passed from step to
-step.
-It is kept as soon as the limiter has decided, so after any later error the way to rest begins at the last command. The
-reference of a tick is the face at (tick time + lead of the joint, as far as the plan in force goes); speed and
-acceleration are central differences, so one sample lies one tick ahead.
+There is one tick every 1/rate_hz s, on absolute deadlines. Everything that changes during a run is in a `LoopState`
+that is passed from step to step. The new state is kept as soon as the limiter has returned its goals, so after a later
+error the way to rest begins at the last command. The reference of a tick is the face at the tick's time plus the lead
+of the joint, as far as the plan in force reaches. Its speed and acceleration are central differences, so one sample
+lies one tick ahead.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from sfms_robot.runtime.states import Fade, Presence, RunState
 from sfms_robot.signals.minimum_jerk import ease
 
 LOOK_S: Final = 0.1  # period of the check for lost servos
-WARMTH_S: Final = 1.0  # and of temperatures
-AWAY_S: Final = 1.0  # a position older than this: the servo is away
-PINCH: Final = "pinch"  # a fault that begins so
+WARMTH_S: Final = 1.0  # period of the check of temperatures
+AWAY_S: Final = 1.0  # a servo whose position is older than this is away
+PINCH: Final = "pinch"  # beginning of the fault of a joint that pinches
 _LOADED: Final = np.fft, np.ma  # numpy imports both at their first use, which must not be inside the loop
 _TURNING: Final = [CHANNEL_INDEX[name] for name in CHANNELS if name in ("yaw", "pitch") or name.startswith("eyeLook")]
 
@@ -45,7 +45,7 @@ class Motion:
     """The parts between a plan and the bus; (J,) in joint order.
 
     Attributes:
-        leads_s, rest_rad: (J,).
+        leads_s, rest_rad: (J,) lead and rest angle of each joint.
         holds: (J,) joints that keep their torque when halted; None: no joint does.
         heat: temperature derating; None disables it.
     """
@@ -64,12 +64,12 @@ class Parts(Motion):
     """The parts of a run, put together by `app`.
 
     Attributes:
-        knobs: called at every tick for the knobs of the head; None: those of its file.
-        overlay: (motion (N, 58), times (N,)) -> motion adds the commands of a program to the plan.
-        answers: the plan shows only while a person is there.
-        halt: read at every tick.
+        knobs: function called at every tick, returns the knobs of the head; None: those of its file.
+        overlay: function (motion (N, 58), times (N,)) -> motion, which adds the commands of a program to the plan.
+        answers: whether the plan is shown only while `Presence.answered` is true.
+        halt: the emergency stop, read at every tick.
         ignored: joints whose faults are known and accepted.
-        missing: called at every tick for names of further lost parts.
+        missing: function called at every tick, returns the names of further lost parts.
     """
 
     source: Source
@@ -91,13 +91,13 @@ class LoopState:
 
     Attributes:
         held_rad, since_s: (J,) the pose in which torque came on, and its time.
-        before_rad, here_rad: (J,) two samples of the reference: of the last command, and of the next.
-        goals_rad: (J,) the last command; `motion` (58,) the face behind it, `reach_s` the latest instant of the
+        before_rad, here_rad: (J,) two samples of the reference: the one of the last command and that of the next.
+        goals_rad: (J,) the last command; `motion` (58,) the face that it shows, `reach_s` the latest instant of the
             timeline that it used.
         run: the state of the run, judged by `presence` and `lost_joints`.
-        answer: share of the listener's answer that shows.
-        released: (J,) joints that a halt has let go of and that have not come back; their goals stand still.
-        stands: it is halted, and has let go of all that it does not hold.
+        answer: share of the listener's answer that is shown.
+        released: (J,) joints that a halt has released and that are not back yet; their goals do not change.
+        stands: whether the head stands in a halt and has released all joints that it does not hold.
     """
 
     timeline: Any
@@ -132,7 +132,7 @@ def drive(
     """Run: torque on, ease in, listen for `duration_s`, ease to rest, torque off. Return "done" or "interrupted".
 
     Blocks until then. After any error every bus that still works eases its joints to rest, and `bus.stop` is called
-    before the error is raised further.
+    before the error leaves this function.
     """
     observers = Observers(parts.observers)
     log.detached = observers.detached
@@ -186,14 +186,14 @@ def drive(
 
 
 def _enabled(parts: Parts, log: RunLog, interrupted: Callable[[], bool]) -> LoopState | None:
-    """Switch torque on, joint by joint; None if the run is interrupted meanwhile."""
+    """Switch torque on, joint by joint, and return the first state; None if the run is interrupted meanwhile."""
     held_rad = np.zeros(len(parts.retargeter.joints))
     for index, joint in enumerate(parts.retargeter.joints):
         if interrupted():
             return None
         held_rad[index] = parts.bus.enable([joint])[0]
         if parts.halt.causes:
-            parts.bus.torque_off("release")  # again: what the watcher sent may have come between two joints
+            parts.bus.torque_off("release")  # again: the watcher's packet may have come between two joints
             raise BusError(f"halted by {', '.join(parts.halt.causes)} while joints were switched on")
     log.start(held_rad)
     return LoopState(
@@ -221,7 +221,7 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
     timeline = state.timeline
     for plan in parts.feed.poll(now_s):
         if not np.isfinite(plan.frames).all():
-            log.refused_plans += 1  # a model gone wrong: the plans before it stay in force
+            log.refused_plans += 1  # an error of the model: earlier plans stay in force
             continue
         timeline = parts.timeline.accept(plan, timeline)
         log.planned(plan)
@@ -230,14 +230,14 @@ def _heard(parts: Parts, observers: Observers, log: RunLog, now_s: float, state:
 
 
 def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopState:
-    """Return the state with the state of the run from here on."""
+    """Return the loop's state with the present state of the run in `run`."""
     presence = state.presence
     listener = ("listener",) if parts.feed.lost else ()
     lost = (*parts.source.missing, *listener, *parts.missing(), *state.lost_joints)
     eased_in = bool(now_s - state.since_s.max(initial=0.0) >= EASE_S)
     halted, released = parts.halt.causes, state.released
     if not halted and state.run.name == "halted" and not state.stands:
-        halted = state.run.why  # it ends when the head stands, not before
+        halted = state.run.why  # a halt does not end before the head stands
     run = state.run.then(
         now_s,
         eased_in=eased_in,
@@ -261,10 +261,10 @@ def _ended(
     log.entered(run, now_s)
 
     def seen(time_s: float, ahead: float, goals_rad: Doubles, readings: Readings) -> None:
-        """Observe a tick of the way to rest, of which the share `ahead` remains: the last face fades with it."""
+        """Report a tick of the way to rest to the observers; the last face fades with `ahead`, the remaining share."""
         observers.tick(Tick(time_s, state.motion * np.float32(ahead), goals_rad, readings, run.name, run.why))
 
-    if not parts.halt.causes:  # a head that was halted moves no more
+    if not parts.halt.causes:  # a halted head does not move to rest
         come_to_rest(
             parts.bus,
             parts.limiter,
@@ -316,10 +316,10 @@ def _commanded(parts: Parts, now_s: float, period_s: float, state: LoopState) ->
 
 
 def _halted(parts: Parts, now_s: float, state: LoopState) -> LoopState:
-    """Brake; once all joints stand, release those that need not hold."""
+    """Brake all joints; once they stand, release those that need not hold."""
     goals_rad, limiter = parts.limiter.brake(state.limiter)
     released, stands = state.released, state.stands
-    if state.run.since_s == now_s and released.any():  # on their way back from an earlier halt
+    if state.run.since_s == now_s and released.any():  # joints on their way back from an earlier halt
         _let_go(parts, released)
     if not stands and np.array_equal(goals_rad, state.goals_rad):
         stands, released = True, np.ones_like(released) if parts.holds is None else released | ~parts.holds
@@ -335,7 +335,7 @@ def _let_go(parts: Parts, which: Bools) -> None:
 
 
 def _resumed(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopState:
-    """End a halt: held joints ease in from their present angles, the others from those they return at."""
+    """End a halt: held joints ease in from their present angles, the others from the angles at which they come back."""
     parts.bus.resume(parts.retargeter.joints)
     every = np.ones_like(state.released)
     back = state.released & np.array([joint not in parts.ignored for joint in parts.retargeter.joints], np.bool_)
@@ -343,12 +343,12 @@ def _resumed(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopS
 
 
 def _rejoined(parts: Parts, log: RunLog, readings: Readings, state: LoopState, now_s: float) -> LoopState:
-    """Ease in joints that were away again from their present angles, as at the start."""
+    """Ease in joints that have come back, from their present angles, as at the start."""
     joints = parts.retargeter.joints
     back = np.array([joint in readings and readings[joint].rejoined for joint in joints], np.bool_)
     if not back.any():
         return state
-    stands_rad = state.goals_rad.copy()  # also for a servo without a position
+    stands_rad = state.goals_rad.copy()  # the goal stays in use for a servo without a position
     for index in np.flatnonzero(back).tolist():
         position_rad = readings[joints[index]].position_rad
         stands_rad[index] = stands_rad[index] if position_rad is None else position_rad
@@ -358,7 +358,7 @@ def _rejoined(parts: Parts, log: RunLog, readings: Readings, state: LoopState, n
 def _eased_in_from(
     parts: Parts, log: RunLog, stands_rad: Doubles, which: Bools, state: LoopState, now_s: float
 ) -> LoopState:
-    """Return the state in which `which` (J,) joints ease in from standing at `stands_rad` (J,), from `now_s` on."""
+    """Return the state in which the joints `which` (J,) stand at `stands_rad` (J,) and ease in from `now_s` on."""
     log.restart(which, stands_rad)
 
     def stand(angles_rad: Doubles) -> Doubles:
@@ -372,7 +372,7 @@ def _eased_in_from(
 
 
 def _noticed(parts: Parts, readings: Readings, state: LoopState, now_s: float, period_s: float) -> LoopState:
-    """Use the readings: servos that are away, faulty or warm; a pinch while halted releases all at once."""
+    """Note servos that are away, faulty or warm by their readings; a pinch while halted releases all joints at once."""
     heat = state.heat
     if parts.heat:
         if _due(now_s, period_s, WARMTH_S):
@@ -394,5 +394,5 @@ def _noticed(parts: Parts, readings: Readings, state: LoopState, now_s: float, p
 
 
 def _due(now_s: float, period_s: float, every_s: float) -> bool:
-    """Return whether this is the first tick of a new `every_s`."""
+    """Return whether this is the first tick in a new period of `every_s`."""
     return math.floor(now_s / every_s + 1e-9) != math.floor((now_s - period_s) / every_s + 1e-9)

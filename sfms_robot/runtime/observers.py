@@ -1,6 +1,6 @@
 """Observers of a run: the list that the loop calls, the status document, and systemd.
 
-An observer that raises is detached and named once: observing never ends a run.
+An observer that raises is detached and logged once, so that observing never ends a run.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sfms_robot.ports import Document, Facts, Observer, Tick
 from sfms_robot.runtime.states import RUNNING, RunState
 from sfms_robot.signals.audio import energy_db
 
-IDLE_S: Final = 1.0  # period of `ServiceManager.alive` where no watchdog asks for more
+IDLE_S: Final = 1.0  # period of `ServiceManager.alive` without a watchdog
 _DIGITS: Final = 4
 _NOTES: Final[Mapping[str, str]] = {
     "starting": "joints are led into the face",
@@ -64,15 +64,15 @@ class Observers:
 
 
 class RunStatus(Observer):
-    """The state of a run at this moment as one document, for the terminal's panel, `--status` and the page.
+    """Observer that returns the present state of a run as one document, for terminal panel, `--status` and the page.
 
-    Keeps the newest of everything; the document is built on request, in the requesting thread, so that the loop pays
-    for three assignments a tick.
+    Keeps the newest tick, frame and plan time. The document is built on request, in the requesting thread, so that the
+    loop only makes three assignments a tick.
 
     Args:
         joints: names, in the order of `Tick.goals_rad`.
         facts: constant entries, such as head and port.
-        figures: called for further entries of each document.
+        figures: function that returns further entries of each document.
     """
 
     def __init__(
@@ -97,11 +97,11 @@ class RunStatus(Observer):
         self._planned_s = plan.made_at_s
 
     def ended(self, state: RunState) -> None:
-        """Show the last state of the run from now on: torque is off, or could not be confirmed off."""
+        """Set the last state of the run, shown from now on: torque is off, or could not be confirmed off."""
         self._ended = {"state": state.name, "why": list(state.why)}
 
     def document(self) -> Report:
-        """Return the document that `--status` serves. From any thread. JSON has no inf and no NaN: null."""
+        """Return the document that `--status` serves. From any thread. inf and NaN, which JSON lacks, become null."""
         seen, frame = self._tick, self._frame
         document: Report = {
             "version": 1,
@@ -157,12 +157,12 @@ def _number(value: float | None) -> float | None:
 class ServiceManager:
     """The notifications that a service manager expects: ready, alive, stopping (sd_notify(3), sd_watchdog_enabled(3)).
 
-    Datagrams of lines to the unix socket that NOTIFY_SOCKET names ("@" begins an abstract name); without it nothing is
-    sent. WATCHDOG_USEC is the longest silence allowed; systemd advises half of it as period. Never raises: a run does
-    not end because a datagram is lost.
+    They are datagrams of lines, sent to the unix socket that NOTIFY_SOCKET names ("@" begins an abstract name); without
+    this variable nothing is sent. WATCHDOG_USEC is the longest silence allowed; systemd advises half of it as period.
+    Never raises, so that a lost datagram does not end a run.
 
     Attributes:
-        wanted: a service manager is there.
+        wanted: whether there is a service manager.
         every_s: period at which `alive` is to be called.
     """
 
@@ -204,7 +204,7 @@ class ServiceManager:
 class NotifyingObserver(Observer):
     """Observer that reports a run as ready when its joints are led into the face, and as alive while it ticks.
 
-    So the service manager restarts a loop that hangs, whatever else still runs.
+    The service manager therefore restarts a loop that hangs, even if other parts of the program still run.
     """
 
     manager: ServiceManager
@@ -213,7 +213,7 @@ class NotifyingObserver(Observer):
     _shown: tuple[str, Names] | None = None
 
     def tick(self, seen: Tick) -> None:
-        """Send at most one datagram in most ticks, without waiting for it."""
+        """Send changes of state and the watchdog's message, in most ticks at most one datagram, without waiting."""
         if (seen.state, seen.why) != self._shown:
             self._shown = seen.state, seen.why
             words = ": ".join([seen.state, *([", ".join(seen.why)] if seen.why else [])])

@@ -1,8 +1,9 @@
-"""Events that a listener is about to show: those it has decided, or nods, blinks and smiles found in its plans.
+"""Events that a listener is about to show: events that it decided, or nods, blinks and smiles found in its plans.
 
-A listener with events puts each one into a plan before it begins, with its evidence (`frames.Plan.events`). For others
-the planned frames, newest over oldest, are one motion at 25 Hz, and the detectors of `signals.events` search its last
-seconds: a nod or a blink is reported when a plan holds it whole, a smile when it has lasted 0.4 s; each once.
+A listener with events puts each event into a plan before it begins, with its evidence (`frames.Plan.events`). For other
+listeners the planned frames are joined to one motion at 25 Hz, in which newer frames replace older ones. The detectors
+of `signals.events` search its last seconds. A nod or a blink is reported when a plan contains it completely, a smile
+when it has lasted 0.4 s. Each is reported once.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from sfms_robot.signals.events import MOTION_EVENTS
 log = logging.getLogger(__name__)
 
 WINDOW: Final = 8 * FRAME_HZ  # frames that are searched; no nod is longer
-NEWS: Final = 2 * FRAME_HZ  # an event that ended more frames ago is not new: the edge of the window made it
-MOST_WAITING: Final = 10 * FRAME_HZ  # plans
+NEWS: Final = 2 * FRAME_HZ  # an event that ended more frames ago is not new, but an artefact of the window's edge
+MOST_WAITING: Final = 10 * FRAME_HZ  # plans that wait for callbacks, at most
 
 TakeEvent = Callable[[ListenerEvent], object]
 
@@ -38,7 +39,7 @@ class PlannedEvents:
         self._signals = np.zeros((len(MOTION_EVENTS), 0))
         self._first = 0  # index, in frames of 40 ms, of the first column
         self._reported_s: dict[str, float] = {}
-        self._decided: list[ListenerEvent] | None = None  # None: a listener that decides none
+        self._decided: list[ListenerEvent] | None = None  # None: a listener without events
 
     def add(self, plan: Plan) -> list[ListenerEvent]:
         """Return the events that this plan completes, in the order of their beginnings."""
@@ -61,11 +62,11 @@ class PlannedEvents:
         columns = np.array([kind.signal(plan.frames) for kind in MOTION_EVENTS.values()], np.float64)
         begins = round(float(plan.times_s[0]) * FRAME_HZ)
         known = self._signals.shape[1]
-        if not known or not 0 <= begins - self._first <= known + WINDOW:  # the first plan, or one of another time
+        if not known or not 0 <= begins - self._first <= known + WINDOW:  # the first plan, or a jump in time
             self._signals, self._first, known = columns[:, :0], begins, 0
             self._reported_s = dict.fromkeys(MOTION_EVENTS, float("-inf"))
         at = begins - self._first
-        if at > known:  # a gap without plans: the face stays
+        if at > known:  # a gap without plans: the face is held
             self._signals = np.pad(self._signals, ((0, 0), (0, at - known)), mode="edge")
         joined = np.concatenate([self._signals[:, :at], columns], axis=1)
         self._first += max(0, joined.shape[1] - WINDOW)
@@ -84,13 +85,13 @@ class PlannedEvents:
 
 
 class EventWatch(Observer):
-    """Observer that calls callbacks with events, in a thread of its own: the loop only hands over the plans.
+    """Observer that calls callbacks with events, in a separate thread: the loop only passes the plans on.
 
-    Callbacks run one after the other. One that raises is detached and named; plans that wait for a slow one for longer
-    than ten seconds are left out.
+    Callbacks run one after the other. A callback that raises is detached and logged. While a slow one runs, only the
+    newest `MOST_WAITING` plans are kept; older ones are left out.
 
     Args:
-        callback: called with events of every kind; None: `on` alone.
+        callback: called with events of every kind; None: only the callbacks of `on` are called.
 
     Attributes:
         detached: callbacks that raised, and their errors.

@@ -1,17 +1,18 @@
 """Recording of a run: an observer that writes DIR/run.mcap, which `replay` and Foxglove open.
 
-The loop only drops a value into a bounded queue; a thread of its own encodes and writes. When the queue is full a
-value is dropped and counted, never waited for - except in virtual time, where waiting costs nothing and the file must
-be whole. Chunks are small, so that the file of a killed run can be read up to its last second. A run of hours
-continues in DIR/run-0002.mcap and so on, each a whole file of its own: an index of all chunks would grow with the run.
+The loop only puts values into a bounded queue; a separate thread encodes and writes them. When the queue is full, a
+value is dropped and counted, and the loop does not wait. It waits in virtual time only, where waiting costs nothing and
+the file must be complete. Chunks are small, so that the file of a killed run can be read up to its last second. A run
+of hours continues in DIR/run-0002.mcap and so on. Each is a complete file, because an index of all chunks would grow
+with the run.
 
 Topics: /speaker (25 Hz: sound, level, face, attention, place, and the robot's own voice), /plan (per plan), /event
 (decisions with their evidence; of a listener without events, nods, blinks and smiles found in its plans), /face (per
-tick: the 58 requested channels), /joints (per tick and joint: goal, present, age, fault), /servos (once a second: their
-other values), /state (when it changes).
+tick: the 58 requested channels), /joints (per tick and joint: goal, present, age, fault), /servos (once a second: other
+values of the servos), /state (when it changes).
 
-In the format "ros2" each of them is a std_msgs/String with the same JSON under /sfms_robot, and there are the topics of
-ROS's own types that `_typed` makes of it, all as CDR. Times are those of the run, from 0.
+In the format "ros2" each message is a std_msgs/String with the same JSON under /sfms_robot, and `_as_ros2` adds topics
+of ROS's own types, all as CDR. Times are those of the run, from 0.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ RecordFormat = Literal["json", "ros2"]
 Message = tuple[str, float, Report]
 
 _QUEUE_LENGTH: Final = 2000  # ten seconds of a 100 Hz loop
-_CHUNK_BYTES: Final = 64 * 1024  # short stalls, and little is lost when a run is killed
+_CHUNK_BYTES: Final = 64 * 1024  # small: stalls are short, and little is lost when a run is killed
 PART_MESSAGES: Final = 100_000  # about seven minutes of a 100 Hz loop
 SERVOS_S: Final = 1.0
 EVENTS_S: Final = 1.0
@@ -112,7 +113,7 @@ ROS2_TOPICS: Final = {topic: f"/sfms_robot{topic}" for topic in _SCHEMAS} | {"/e
 class Recorder(Observer):
     """Observer that writes a run to a folder.
 
-    joints: names, in the order of `Tick.goals_rad`. wait: for room in the queue, in virtual time.
+    joints: names, in the order of `Tick.goals_rad`. wait: whether to wait for room in the queue (virtual time).
     about: further texts to keep in the file. Raises ConfigError when the folder cannot be written to.
     """
 
@@ -149,7 +150,7 @@ class Recorder(Observer):
         self._thread = start_thread(self._work, "recorder")
 
     def tick(self, seen: Tick) -> None:
-        """Queue a tick. The readings are copied, because the bus may change its own later."""
+        """Queue a tick. The readings are copied, because the bus may change them later."""
         self._put(replace(seen, readings=dict(seen.readings)))
 
     def _put(self, value: Tick | SpeakerFrame | Plan) -> None:
@@ -169,7 +170,7 @@ class Recorder(Observer):
         self._put(plan)
 
     def close(self) -> None:
-        """Write what is queued and finish the file. Idempotent."""
+        """Write the queued values and finish the file. Idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -187,12 +188,12 @@ class Recorder(Observer):
         return {"messages": self._written, "dropped": self._dropped, "bytes": size, "trouble": self._trouble}
 
     def _begin(self) -> None:
-        """Open the next file and write its head. Raises ConfigError where it cannot be written."""
+        """Open the next file and write its head. Raises ConfigError if it cannot be written."""
         self._parts += 1
         self._in_part = 0
         with _naming(self._folder), ExitStack() as stack:
             self._folder.mkdir(parents=True, exist_ok=True)
-            for old in parts_of(self._folder) if self._parts == 1 else ():  # of a recording that may be replaced
+            for old in parts_of(self._folder) if self._parts == 1 else ():  # files of a recording that may be replaced
                 old.unlink()
             self._file = (self._folder / part_name(self._parts)).open("wb")
             stack.callback(self._file.close)
@@ -208,7 +209,7 @@ class Recorder(Observer):
         self._attempt(self._file.close)
 
     def _work(self) -> None:
-        """Write until `close`, in the thread. After trouble with the file only empty the queue."""
+        """Write values until `close`; runs in the thread. After an error of the file, only empty the queue."""
         while (value := self._queue.get()) is not None:
             if self._trouble is None:
                 self._attempt(partial(self._write, value))
@@ -216,7 +217,7 @@ class Recorder(Observer):
             self._attempt(partial(self._write, None))
 
     def _attempt(self, action: Callable[[], Any]) -> None:
-        """Call `action`; any failure of the file ends the recording, not the run, and is in the report."""
+        """Call `action`. An error of the file is put into the report and ends the recording, not the run."""
         try:
             with _naming(self._folder):
                 action()
@@ -239,7 +240,7 @@ class Recorder(Observer):
             self._begin()
 
     def _messages(self, value: Tick | SpeakerFrame | Plan | None) -> Iterator[Message]:
-        """Yield the messages of a value: topic, time, body; of None the last events."""
+        """Yield (topic, time, body) of each message of a value; for None those of the last events."""
         match value:
             case None:
                 yield from self._news(math.inf)
@@ -322,7 +323,7 @@ def _ros2_channels(writer: Writer) -> dict[str, int]:
 
 
 def _as_ros2(topic: str, time_s: float, body: Facts, text: bytes) -> Iterator[tuple[str, bytes]]:
-    """Yield the messages of ROS 2 that one of ours becomes: topic, CDR."""
+    """Yield (topic, CDR) of each ROS 2 message made from one of our messages."""
     from sfms_robot.signals import ros2_messages as ros2
 
     yield ROS2_TOPICS[topic], ros2.to_cdr(ros2.STRING, {"data": text.decode()})
@@ -346,7 +347,7 @@ def _as_ros2(topic: str, time_s: float, body: Facts, text: bytes) -> Iterator[tu
 
 
 def check_folder(folder: Path, overwrite: bool = False) -> None:
-    """Raise ConfigError where a run cannot be recorded, or one is already that may not be overwritten."""
+    """Raise ConfigError if the folder cannot be used, or holds a recording that may not be overwritten."""
     with _naming(folder):
         there = (folder / RUN_FILE).exists()
     if there and not overwrite:

@@ -2,9 +2,9 @@
 
 A warm servo moves less, and so slower; a hot one goes to rest and stays there until it has cooled. Every joint has a
 share: 1 shows the requested angle, 0 is its rest angle. The share is `WARM_SHARE` while the servo is warm and 0 while
-it is hot, changes over seconds, and comes back `COOLER_C` below the threshold that it left at. Joints that show one
-pose together (a neck) use the smallest of their shares. A servo without a temperature counts as cool; at its own limit
-its own protection acts, and `on_fault` of the joint.
+it is hot. It changes over seconds, and rises again `COOLER_C` below the threshold at which it fell. Joints that show
+one pose together (a neck) use the smallest of their shares. A servo without a temperature counts as cool; at its own
+limit the protection of the servo acts, and `on_fault` of the joint.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from sfms_robot.runtime.log import RunLog
 from sfms_robot.signals.minimum_jerk import ease
 
 EASE_S: Final = 1.0  # torque-on pose -> live face, and live face -> rest
-REST_LIMIT_S: Final = 60.0  # of the whole way to rest; twice the need of the slowest joint of a shipped head
-ARRIVED_RAD: Final = 1e-4  # of a goal
-STANDS_RAD: Final = 0.01  # of a servo: its gear and its load leave it a little short
-FOLLOW_S: Final = 0.3  # that servos are given after their goals have arrived
-FAILURES: Final = 3  # ticks in a row that may raise on the way to rest
+REST_LIMIT_S: Final = 60.0  # longest way to rest; twice what the slowest joint of a shipped head needs
+ARRIVED_RAD: Final = 1e-4  # a goal this close to rest has arrived
+STANDS_RAD: Final = 0.01  # a servo this close to rest has arrived: gear and load leave it a little short
+FOLLOW_S: Final = 0.3  # longest wait for servos after their goals have arrived
+FAILURES: Final = 3  # failed ticks in a row after which the way to rest ends
 WARM_SHARE: Final = 0.5
 COOLER_C: Final = 3.0
-PER_S: Final = 0.5  # of the share: from moving to rest in two seconds
+PER_S: Final = 0.5  # highest rate of the share: from moving to rest in two seconds
 
 Seen = Callable[[float, float, Doubles, Readings], None]  # time, share of the way ahead, goals, readings
 logger = logging.getLogger(__name__)
@@ -53,11 +53,11 @@ def come_to_rest(
 ) -> None:
     """Ease every joint to its rest angle under the limits; blocks for at least `EASE_S` and at most `REST_LIMIT_S`.
 
-    Takes as long as the limiter needs to bring its goals there, so that no joint loses its torque on the way. It needs
-    time of its own ticks, so a computer that is late for some takes longer. Once the goals have arrived, servos have
-    `FOLLOW_S` to follow, whether they move or not. A tick that raises (a bus that fails, a goal that is refused) is
-    logged and left out; after `FAILURES` in a row it gives up. `seen` is called after every other one. Never raises an
-    Exception.
+    Takes as long as the limiter needs to bring its goals there, so that no joint loses its torque on the way. The
+    limiter moves on once per tick, so a computer that misses ticks takes longer. Once the goals have arrived, servos
+    have `FOLLOW_S` to follow, whether they move or not. A tick that raises (a bus that fails, a goal that is refused)
+    is logged and left out; `FAILURES` in a row end the way. `seen` is called in every tick that does not raise before.
+    Never raises an Exception.
     """
     span = rest_rad - from_rad
     began_s: float | None = None
@@ -81,7 +81,7 @@ def come_to_rest(
                 places = [readings[joint].position_rad if joint in readings else None for joint in bus.joints]
                 stand = all(at is None or abs(at - r) < STANDS_RAD for at, r in zip(places, rest_rad, strict=True))
                 arrived = stand or tick.time_s - arrived_s >= FOLLOW_S
-        except Exception as error:  # of any kind: the other buses are still to be eased
+        except Exception as error:  # any kind: the other buses must still be eased
             failed += 1
             logger.error("on the way to rest: %s", error)
         if failed >= FAILURES or (arrived and since_s >= EASE_S) or since_s >= REST_LIMIT_S:
@@ -93,8 +93,8 @@ class Heat:
     """Derating of the joints, (J,) each.
 
     Attributes:
-        share: of the requested angle that a joint shows.
-        wanted: the share that it moves toward.
+        share: share of the requested angle that each joint shows.
+        wanted: the value that `share` moves toward.
     """
 
     share: Doubles
@@ -112,14 +112,14 @@ class Heat:
 
 @dataclass(frozen=True)
 class HeatGuard:
-    """Temperature derating. warm_C, hot_C: (J,). together: columns of joints that show one pose."""
+    """Temperature derating. warm_C, hot_C: (J,) thresholds. together: columns of joints that show one pose together."""
 
     warm_C: Doubles
     hot_C: Doubles
     together: list[int]
 
     def judge(self, temperatures_C: Doubles, heat: Heat) -> Heat:
-        """Return the shares to move toward for temperatures (J,), NaN where not known."""
+        """Return the shares to move toward for temperatures (J,), NaN where unknown."""
         left_hot = np.where(heat.wanted < WARM_SHARE, COOLER_C, 0.0)
         left_warm = np.where(heat.wanted < 1.0, COOLER_C, 0.0)
         with np.errstate(invalid="ignore"):  # NaN is not hot
@@ -158,7 +158,7 @@ class Interrupt:
         self._bus: Bus | None = None
 
     def arm(self, bus: Bus) -> None:
-        """Note that torque comes on; a second request releases `bus`."""
+        """Record that torque comes on: from now on a second request releases `bus`."""
         self._bus = bus
 
     def __call__(self) -> bool:
@@ -174,8 +174,8 @@ class Interrupt:
     def on_signal(self, number: int, frame: FrameType | None) -> None:
         """Count a request in the main thread's signal handler. Ctrl-\\ releases at once, as a second Ctrl-C does.
 
-        Raises KeyboardInterrupt before torque, `Released` at the second request, which interrupts a call that blocks.
-        Later ones send torque-off again and raise nothing, so that the cleaning up continues.
+        Raises KeyboardInterrupt before torque is on, and `Released` at the second request, which interrupts a call that
+        blocks. Later requests send torque-off again and raise nothing, so that the cleaning up continues.
         """
         before = self._asked
         if number == getattr(signal, "SIGQUIT", None):
@@ -191,9 +191,9 @@ class Interrupt:
 def signals_to(interrupt: Interrupt) -> Iterator[None]:
     """Turn SIGINT, SIGTERM, SIGHUP and SIGQUIT into requests, so that no write is cut in half. Restored on exit.
 
-    Ctrl-C, kill, a terminal or connection that closes, Ctrl-\\; the last two do not exist on Windows. SIGHUP only where
-    it is not ignored: under nohup a lost terminal ends nothing. Only in the main thread: Python gives signals to no
-    other.
+    Their sources are Ctrl-C, kill, a terminal or connection that closes, and Ctrl-\\; the last two do not exist on
+    Windows. SIGHUP is used only where it is not ignored: under nohup a lost terminal ends nothing. Main thread only,
+    because Python delivers signals to no other thread.
     """
     names = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
     numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]

@@ -1,19 +1,20 @@
 """The states of a run, the arrows between them, and the presence of a person, which decides some of them.
 
     starting        torque comes on, joints ease in
-    idle            no person is there: the head moves a little, and answers nothing
+    idle            no person is there: the head moves a little and does not answer
     listening       a person is there
     speaking        the robot's own voice is being played
-    degraded        it continues without something: `why` names it
+    degraded        the run continues without parts that `why` names
     halted          emergency stop, latched: `why` names every cause; ends when none is left
-    stopping        it comes to rest
-    stopped, fault  torque is off: as asked, or by an error that `why` names, or could not be confirmed off
+    stopping        the head comes to rest
+    stopped         torque is off as requested
+    fault           torque is off after an error that `why` names, or could not be confirmed off
 
 A state is a value. The table of every arrow, its cause and its longest time is in docs/safety.md; `ARROWS` is the same
 table, and no other arrow is ever taken.
 
-A person is there while a face is seen or a voice was heard within `GONE_S`. The robot speaks while its own voice, as it
-is being played, has sound, pauses between words included: neither a text nor the person's words end its turn.
+A person is there if a face was seen or a voice was heard within the last `GONE_S`. The robot speaks while its own voice
+has sound as it is being played, pauses between words included. A text, or the person's words, do not end its turn.
 """
 
 from __future__ import annotations
@@ -29,11 +30,11 @@ from sfms_robot.signals.audio import energy_db
 from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.voice_activity import Ear
 
-GONE_S: Final = 10.0  # neither seen nor heard for so long
-LOST_S: Final = 0.5  # without sound or face from any source
-TURN_GAP_S: Final = 0.6  # a pause between the robot's own words
+GONE_S: Final = 10.0  # a person neither seen nor heard for longer is gone
+LOST_S: Final = 0.5  # longest time without sound or face from any source in which answers are shown
+TURN_GAP_S: Final = 0.6  # longest pause between the robot's own words
 SAYS_DB: Final = -45.0  # the played signal is clean: anything louder is speech
-FADE_S: Final = 0.5  # of the listener's answer, when a person comes or goes
+FADE_S: Final = 0.5  # fade of the listener's answer when a person comes or goes
 _NEVER_S: Final = -float("inf")
 
 Activity = Literal["idle", "listening", "speaking"]
@@ -54,11 +55,11 @@ ARROWS: Final = frozenset(
 
 @dataclass(frozen=True)
 class RunState:
-    """A state and since when [s, loop time].
+    """A state of the run and the time at which it began [s, loop time].
 
     Attributes:
         why: the lost parts, the causes of a halt, or the error; empty otherwise.
-        doing: its activity if nothing were lost.
+        doing: the activity, regardless of lost parts.
     """
 
     name: StateName = "starting"
@@ -77,16 +78,16 @@ class RunState:
         halted: Names = (),
         ending: bool = False,
     ) -> RunState:
-        """Return the state at `now_s`; `since_s` changes with the name.
+        """Return the state at `now_s`; `since_s` changes when the name does.
 
         Args:
             now_s: loop time.
-            eased_in: every joint has been led from where it was found into the face.
-            person: a person is there.
-            speaking: the robot's own voice is being played.
+            eased_in: whether every joint has been led from where it was found into the face.
+            person: whether a person is there.
+            speaking: whether the robot's own voice is being played.
             lost: sources, "listener" and joints that the run continues without.
             halted: causes of an emergency stop, while it is latched.
-            ending: the run is on its way to rest.
+            ending: whether the run is on its way to rest.
         """
         if self.name in ("stopped", "fault"):
             return self
@@ -115,7 +116,7 @@ class Presence:
     Attributes:
         ear: the person's voice activity.
         watched: their last sighting, and the last sound of the robot itself.
-        heard_s: time of their last voice.
+        heard_s: time of the person's last speech.
         sensed_s: time of the last input, silence included.
     """
 
@@ -144,7 +145,7 @@ class Presence:
         return now_s - max(seen_s, self.heard_s) <= GONE_S
 
     def answered(self, now_s: float) -> bool:
-        """Return whether the plans of the listener show: a person is there and sensed, or the robot speaks."""
+        """Return whether the listener's plans are shown: a person is there and sensed, or the robot speaks."""
         return self.speaking(now_s) or (self.person(now_s) and now_s - self.sensed_s <= LOST_S)
 
     def speaking(self, now_s: float) -> bool:
@@ -154,7 +155,7 @@ class Presence:
 
 @dataclass(frozen=True)
 class Fade:
-    """The share of the listener's answer that shows: from `before` to `after`, from `since_s` on for `FADE_S`."""
+    """Share of the listener's answer that is shown: goes from `before` to `after` in `FADE_S`, from `since_s` on."""
 
     before: float = 0.0
     after: float = 0.0
@@ -165,7 +166,7 @@ class Fade:
         return self.before + (self.after - self.before) * ease((times_s - self.since_s) / FADE_S)
 
     def toward(self, share: float, times_s: Doubles) -> Fade:
-        """Return a fade to `share` from the latest of the instants (N,) on: no instant played before changes."""
+        """Return a fade to `share` from the latest of the instants (N,) on, so that no earlier instant changes."""
         if share == self.after:
             return self
         latest = times_s.max(keepdims=True)

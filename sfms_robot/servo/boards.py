@@ -1,20 +1,21 @@
-"""Boards of hobby servos: the bytes to and from each kind, and a port on which their answers, without frame, are read.
+"""Protocols of boards for hobby servos (the bytes to and from each kind), and a port for answers without a frame.
 
 Pololu Maestro (User's Guide, pololu.com/docs/0J40, sections 4.a, 4.e, 5.d and 5.e):
 
-1. Get Errors (A1) clears the errors, and shows that the board is there. One in the serial mode "UART, detect baud rate"
-   ignores all bytes before the baud indication byte AA, which is sent only if the board does not answer: a board that
-   runs may take AA alone for a protocol error.
-2. Any error sends the channels to their home; from the factory that means pulses off. So all goals are sent
-   again after an error.
-3. A board may have "Enable CRC" on, which nothing on the wire reports, so the head's file says it (`crc`). A board that
-   expects a CRC and gets none waits for it and never answers; one that gets a CRC it does not expect has answered
-   before the CRC is there. `connect` checks for both.
-4. All but the Micro Maestro (6 channels) take the targets of neighbouring channels in one Set Multiple Targets (9F).
+1. Get Errors (A1) clears the errors, and shows that the board is there. A board in the serial mode "UART, detect baud
+   rate" ignores all bytes before the baud indication byte AA. This byte is sent only if the board does not answer: a
+   board that already runs may treat AA alone as a protocol error.
+2. Any error moves the channels to their home positions; with factory settings that means pulses off. So all goals are
+   sent again after an error.
+3. A board may have "Enable CRC" on. Nothing on the wire reports this, so it is set in the head's file (`crc`). A board
+   that expects a CRC and gets none waits for it and never answers. A board that gets an unexpected CRC has already
+   answered before the CRC arrives. `connect` checks for both.
+4. All models except the Micro Maestro (6 channels) accept the targets of neighbouring channels in one Set Multiple
+   Targets (9F).
 
-Lynxmotion SSC-32: its wire is slow (9600 baud unless its jumpers say otherwise), so goals arrive a few times a second.
-Each group move is therefore given the time since the one before it: the board draws a straight line between goals
-instead of steps.
+Lynxmotion SSC-32: its wire is slow (9600 baud unless its jumpers select another rate), so goals arrive a few times a
+second. Each group move therefore contains the time since the previous move: the board then interpolates linearly
+between goals instead of moving in steps.
 """
 
 from __future__ import annotations
@@ -34,28 +35,28 @@ from sfms_robot.servo.registers import Table, consecutive
 
 _CHUNK: Final = 4096
 _CURE: Final = "for this bus in the head's file, or change 'Enable CRC' in Pololu's Maestro Control Center"
-_CRC_TRIES: Final = 2  # the first may be spent on what the board still waits for
-TRIES: Final = 3  # of a question, each with and without what a board that has restarted needs
-_MICRO: Final = 6  # channels of the one Maestro without "set multiple targets"
-_SLOW_RAD_S: Final = 3.5  # a slow hobby servo under load: 0.3 s for 60 degrees
-_LONGEST_TRAVEL_S: Final = 0.7  # no joint delays `enable` for longer
-_PULSE_FRAME_S: Final = 0.02  # an SSC-32 sends a pulse this often: lines within need not be drawn
+_CRC_TRIES: Final = 2  # the bytes of the first try may complete a command that the board is still waiting for
+TRIES: Final = 3  # tries of a request, each with and without the bytes that a restarted board needs
+_MICRO: Final = 6  # channels of the Micro Maestro, the only model without Set Multiple Targets
+_SLOW_RAD_S: Final = 3.5  # speed of a slow hobby servo under load: 0.3 s for 60 degrees
+_LONGEST_TRAVEL_S: Final = 0.7  # longest wait of `enable` for one joint
+_PULSE_FRAME_S: Final = 0.02  # pulse period of an SSC-32; shorter moves need no interpolation
 _LONGEST_LINE_S: Final = 0.5
 
 
 class RateLimitedPort:
-    """An open port that knows when its bytes have left, for requests whose answers have no frame.
+    """An open port that tracks when its bytes have left, for requests whose answers have no frame.
 
-    At 9600 baud a command is under way for a fifth of a second after `write` returned; sending more before that only
-    fills a buffer.
+    At 9600 baud a command is still being transmitted for a fifth of a second after `write` has returned. Sending more
+    before that only fills a buffer.
 
     Args:
-        port: owned by this from now on.
-        patience_s: how long an answer may take beyond the time of its bytes.
+        port: owned by this object from now on.
+        patience_s: longest delay of an answer, in addition to the transmission time of its bytes.
 
     Attributes:
-        busy_until_s: when the last byte sent will have left.
-        awaiting: a request is open.
+        busy_until_s: time at which the last byte sent will have left.
+        awaiting: True while a request is waiting for its answer.
     """
 
     def __init__(self, port: Port, baud: int, patience_s: float) -> None:
@@ -74,14 +75,14 @@ class RateLimitedPort:
         return self.port.now_s() >= self.busy_until_s
 
     def send(self, data: bytes) -> float:
-        """Send bytes; return when the first of them leaves. Raises BusError if the port is gone, as all methods do."""
+        """Send bytes; return when the first of them leaves. Raises BusError if the port is gone, like all methods."""
         start_s = max(self.port.now_s(), self.busy_until_s)
         self.port.write(data)
         self.busy_until_s = start_s + len(data) * self._byte_s
         return start_s
 
     def wait(self, until_s: float) -> None:
-        """Block until then; drop what comes in meanwhile."""
+        """Block until `until_s`; drop the bytes that arrive meanwhile."""
         while self.port.now_s() < until_s and self.port.read(_CHUNK, until_s):
             pass
 
@@ -105,7 +106,7 @@ class RateLimitedPort:
         return bytes(self._answer) if len(self._answer) == self._length else b""
 
     def exchange(self, request: bytes, length: int) -> bytes | None:
-        """Send a request; return the answer, None unless exactly `length` bytes came. Blocks until it is overdue."""
+        """Send a request, block until the answer is complete or overdue, and return it; None if the length differs."""
         self.request(request, length)
         return self.answer(block=True) or None
 
@@ -115,20 +116,20 @@ class BoardStatus(NamedTuple):
 
     faults: str = ""
     lasting: bool = False  # the fault is in the board, not only in the bytes it received
-    went_home: bool = False  # it has switched its channels off, or to wherever its home is
+    went_home: bool = False  # the board has moved its channels to their home positions, or switched them off
 
 
 class PulseOutput:
     """The state of one channel of a board.
 
     Attributes:
-        releases: torque off switches it off; otherwise its joint holds.
-        enabled: it gets goals.
-        waiting: enabled, but off: it comes on when it is its turn.
-        resting: switched off by `release`, or by torque off until it is switched on again.
-        pulse: ticks of the pulse that the board sent when it was last asked, 0 for none.
+        releases: True if torque off switches the channel off; otherwise its joint holds.
+        enabled: True if it receives goals.
+        waiting: True if it is enabled but off, until its turn to be switched on.
+        resting: True if it was switched off by `release`, or by torque off, until it is switched on again.
+        pulse: pulse that the board last reported [ticks], 0 for none.
         sent: ticks last sent.
-        arrived: its pulse came on again since the last reading.
+        arrived: True if its pulse came on again since the last reading.
     """
 
     def __init__(self, index: int, servo: BusServo) -> None:
@@ -136,7 +137,7 @@ class PulseOutput:
         self.channel = servo.id
         self.servo = servo
         self.releases = servo.safety.stop == "release"
-        # A slow servo takes this long through the joint's range.
+        # Time in which a slow servo crosses the joint's range.
         self.travel_s = min((servo.max_rad - servo.min_rad) / _SLOW_RAD_S, _LONGEST_TRAVEL_S)
         self.enabled = self.waiting = self.resting = self.arrived = False
         self.pulse = 0
@@ -149,9 +150,9 @@ class Maestro:
     """The bytes to and from a Pololu Maestro, with the compact protocol.
 
     Attributes:
-        table: of its model.
-        crc: its setting "Enable CRC" is on, the head's file says.
-        status_length: bytes of the answer to `status_request`.
+        table: table of its model.
+        crc: whether its setting "Enable CRC" is on, according to the head's file.
+        status_length: length of the answer to `status_request` [bytes].
         factory_us: (shortest, longest) pulse that its factory settings allow, if they are narrower than the board.
         reports_pulses: whether `read_pulses` works.
     """
@@ -177,7 +178,7 @@ class Maestro:
         return BoardStatus(", ".join(self.table.faults_in(bits)), bool(bits & ~maestro.WIRE_ERRORS), bits != 0)
 
     def encode_goals(self, ticks: Mapping[int, int], interval_s: float) -> bytes:
-        """Return what moves channels to `ticks`; the goals before were sent `interval_s` ago, 0 for the first."""
+        """Return the bytes that move channels to `ticks`, `interval_s` after the previous goals; 0 for the first."""
         grouped = (self.table.channels or 0) > _MICRO  # one command can move neighbouring channels
         runs = consecutive(ticks) if grouped else [[channel] for channel in sorted(ticks)]
         commands = (
@@ -189,14 +190,14 @@ class Maestro:
         return b"".join(map(self._sealed, commands))
 
     def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
-        """Return what ends the pulses, whatever the bytes before were; `restarted` as in `status_request`."""
+        """Return the bytes that end the pulses after any other bytes; `restarted` as in `status_request`."""
         off = b"".join(self._sealed(maestro.set_target(channel, maestro.OFF)) for channel in channels)
         return bytes([maestro.BAUD_INDICATION] * restarted) + off
 
     def misfit(self, wire: RateLimitedPort, present: bool) -> str | None:
-        """Return how the board's settings differ from the head's file, and the cure; None if they do not.
+        """Return how the board's settings differ from the head's file, and the correction; None if they agree.
 
-        `present`: it has answered `status_request`.
+        `present`: the board has answered `status_request`.
         """
 
         def answers(request: bytes) -> bool:
@@ -208,11 +209,11 @@ class Maestro:
             return f"expects a CRC: set crc: true {_CURE}" if differs else None
         if answers(question):
             return f"expects no CRC: set crc: false {_CURE}"
-        answers(bytes([maestro.crc7(question)]))  # the board has been waiting for it
+        answers(bytes([maestro.crc7(question)]))  # the CRC of the request above, for which the board is waiting
         return None
 
     def read_pulses(self, wire: RateLimitedPort, channels: Sequence[int]) -> dict[int, int] | None:
-        """Return ticks of the pulses it sends now, 0 for none; None if a channel is not answered."""
+        """Return the present pulses [ticks] by channel, 0 for none; None if a request for a channel is not answered."""
         pulses = {}
         for channel in channels:
             answer = wire.exchange(self._sealed(maestro.get_position(channel)), 2)
@@ -225,8 +226,8 @@ class Maestro:
 class Ssc32:
     """The bytes to and from a Lynxmotion SSC-32, with the methods of `Maestro`.
 
-    It has no error word: it answers, or it does not. It reports pulses in steps of 10 us, and for a channel that it
-    never moved the value is not documented, so `read_pulses` returns None.
+    It has no error register: it answers, or it does not. It reports pulses in steps of 10 us, and the value for a
+    channel that it never moved is not documented, so `read_pulses` returns None.
     """
 
     status_length = 1
@@ -234,7 +235,7 @@ class Ssc32:
     reports_pulses = False
 
     def status_request(self, restarted: bool) -> bytes:
-        """Return a query; after a restart, a carriage return in front ends what line noise had begun."""
+        """Return a query; after a restart it begins with a carriage return, to end a line begun by line noise."""
         return b"\r" * restarted + ssc32.query_moving()
 
     def decode_status(self, answer: bytes) -> BoardStatus | None:
@@ -245,11 +246,11 @@ class Ssc32:
         return ssc32.group_move({channel: ssc32.Move(us) for channel, us in ticks.items()}, round(line_s * 1e3))
 
     def encode_off(self, channels: Sequence[int], restarted: bool) -> bytes:
-        """Return the command, always behind a carriage return: another thread may have been in the middle of a line."""
+        """Return the command after a carriage return, since another thread may have been in the middle of a line."""
         return b"\r" + ssc32.outputs_low(channels)
 
     def misfit(self, wire: RateLimitedPort, present: bool) -> str | None:
-        """Return None: it has no settings that could differ."""
+        """Return None: the board has no settings that could differ."""
         return None
 
     def read_pulses(self, wire: RateLimitedPort, channels: Sequence[int]) -> dict[int, int] | None:
@@ -258,27 +259,27 @@ class Ssc32:
 
 
 def board_for(table: Table, crc: bool) -> Maestro | Ssc32:
-    """Return the protocol of a board. `crc`: what the head's file says of its setting."""
+    """Return the protocol of a board. `crc`: its setting in the head's file."""
     return Maestro(table, crc) if table.family == "maestro" else Ssc32()
 
 
 def answers(board: Maestro | Ssc32, wire: RateLimitedPort, tries: int = 2 * TRIES, restarted: bool = False) -> bool:
-    """Return whether the board answers. Blocks for `tries` answers; `restarted`: as in `status_request`, of the first.
+    """Return whether the board answers. Blocks for at most `tries` answers.
 
-    The question clears the errors of a board, so one that reports damaged bytes every time does not read what is sent:
-    a board with another setting, or no board.
+    `restarted` is for the first request, see `status_request`. A request clears the errors of a board. So a board that
+    reports damaged bytes every time does not read what is sent: it has another setting, or is not such a board.
     """
     for _ in range(tries):
         answer = wire.exchange(board.status_request(restarted), board.status_length)
         status = None if answer is None else board.decode_status(answer)
-        if status is not None and (status.lasting or not status.went_home):  # no bytes to it were damaged
+        if status is not None and (status.lasting or not status.went_home):  # not only a report of damaged bytes
             return True
         restarted = status is None and not restarted
     return False
 
 
 def board_problem(table: Table, board: Maestro | Ssc32, wire: RateLimitedPort) -> str | None:
-    """Return why a head cannot run with what answers on a port, None if it can: the rule of run and doctor."""
+    """Return why a head cannot run with the board on a port, None if it can. Run and doctor share this rule."""
     there = answers(board, wire)
     if misfit := board.misfit(wire, there):
         return f"the {table.model} {misfit}"
@@ -286,7 +287,7 @@ def board_problem(table: Table, board: Maestro | Ssc32, wire: RateLimitedPort) -
 
 
 def board_of(bus: str, servos: Sequence[BusServo]) -> Table:
-    """Return the board of these servos. Raises ConfigError if they are not all on one."""
+    """Return the table of the board of these servos. Raises ConfigError if they are not all on one board."""
     table = servos[0].table
     others = sorted({servo.table.model for servo in servos} - {table.model})
     if others:
@@ -305,7 +306,7 @@ def board_of(bus: str, servos: Sequence[BusServo]) -> Table:
 def pulses_beyond(
     servos: Sequence[BusServo], conversion: TickConversion, table: Table, range_us: tuple[float, float] | None
 ) -> str:
-    """Return the joints, each with the pulses of its range, that do not fit between (shortest, longest)."""
+    """Return the joints whose pulses do not all lie in `range_us` (shortest, longest), each with its pulses."""
     if range_us is None:
         return ""
     pulses = tick_ranges(servos, conversion) * (table.tick_us or 1.0)

@@ -1,4 +1,4 @@
-"""Parts that all buses share: checking goals, losing the port and finding it again; and a bus without servos.
+"""Parts that all buses share: checking goals, and opening a lost port again; and a bus without servos.
 
 A port that fails is closed and opened again a few times a second, by the name of its adapter. Meanwhile nothing is sent
 and nothing is raised. A bus on which no servo has answered for `reconnect_s` has failed.
@@ -34,14 +34,14 @@ T = TypeVar("T")
 L = TypeVar("L", bound=Link)
 log = logging.getLogger(__name__)
 
-REOPEN_S: Final = 0.2  # between two tries to open a lost port
-COUNTS: Final = ("writes", "reads", "errors", "retries", "reconnects")  # of the statistics of every bus
+REOPEN_S: Final = 0.2  # interval between two tries to open a lost port
+COUNTS: Final = ("writes", "reads", "errors", "retries", "reconnects")  # counters in the statistics of every bus
 LEFT_OUT: Final = "left out"  # fault of a joint without a servo in this run
 _SLACK_RAD: Final = 1e-9
 
 
 class Goals:
-    """Checks and conversion of the goals of one bus, joints in bus order; `own` are the ranges of the joints, rad.
+    """Checks and conversion of the goals of one bus, joints in bus order; `own`: the ranges of the joints, rad.
 
     A goal may be sent if it lies in the range in force of its joint (`sfms_robot.ranges`).
 
@@ -56,14 +56,14 @@ class Goals:
         self._servos = tuple(servos)
         self._conversion = conversion
         self.own = Range(np.array([servo.min_rad for servo in servos]), np.array([servo.max_rad for servo in servos]))
-        self._last_rad = self.own.low.copy()  # where each joint was found, or sent last
+        self._last_rad = self.own.low.copy()  # position at which each joint was found, or its last goal
         self._lowest, self._highest = self.own.low - _SLACK_RAD, self.own.high + _SLACK_RAD
         self._outside = False  # a joint was found outside its own range, and may still be there
         self._rad_at_zero = conversion.to_rad(np.zeros(len(servos), np.int64))
         self.rad_per_tick: Doubles = conversion.to_rad(np.ones(len(servos), np.int64)) - self._rad_at_zero
 
     def hold(self, index: int, angle_rad: float) -> None:
-        """Extend the range in force to the angle at which a servo holds, and say so if it is outside its own range."""
+        """Extend the range in force to the angle at which a servo holds; log an angle outside the joint's own range."""
         self._last_rad[index], servo = angle_rad, self._servos[index]
         if not servo.min_rad <= angle_rad <= servo.max_rad:
             self._outside = True
@@ -80,7 +80,7 @@ class Goals:
         return bool(self.own.reaching(self._last_rad).holds(np.asarray(goal_rad), _SLACK_RAD)[index])
 
     def ticks(self, goals_rad: Doubles, sent: Indices) -> Ints:
-        """Convert goals (J,) to ticks (J,). Those at the indices `sent` (n,) are to be sent, and are checked.
+        """Convert goals (J,) to ticks (J,). The goals at the indices `sent` (n,) are to be sent, and are checked.
 
         The range in force of a joint that is sent shrinks to its goal; the others keep theirs. Raises ValueError, with
         nothing changed, for another shape, a goal that is not finite, or one of `sent` outside its range in force.
@@ -100,7 +100,7 @@ class Goals:
             valid = f"{in_force.low[first]:g}..{in_force.high[first]:g} rad"
             raise ValueError(f"goal of {self._servos[first].joint} = {goals_rad[first]:g} rad is not in {valid}")
         ticks = self._conversion.to_ticks(goals_rad)
-        # On the way in from outside: the conversion would clip to the limit, so the tick is computed here.
+        # The joint moves back into its own range. The conversion would clip to the limit, so the tick is computed here.
         for i in np.flatnonzero(~self.own.holds(goals_rad, _SLACK_RAD) & allowed):
             ticks[i] = round((goals_rad[i] - self._rad_at_zero[i]) / self.rad_per_tick[i])
         self._last_rad[sent] = in_force.nearest(goals_rad)[sent]
@@ -121,7 +121,7 @@ class WireBus(ABC, Generic[L]):
         name: name of the bus, for messages.
         servos: in joint order.
         conversion: joint angles (J,) <-> ticks (J,), affine per joint.
-        open_port: opens the port at `baud`, again after the device was gone; the bus owns what it returns.
+        open_port: opens the port at `baud`, and opens it again after the device was gone; the bus owns the port.
         baud: bits per second.
         read_deadline_s: time without a byte after which a servo, or a board, counts as silent.
         config: the bus in the head's file.
@@ -149,15 +149,15 @@ class WireBus(ABC, Generic[L]):
         self._reconnect_s = config.reconnect_s  # time without any answer after which the bus has failed
         self._counts = dict.fromkeys(COUNTS, 0)
         self._link: L | None = None
-        self._powered = frozenset[int]()  # ids whose torque came on and is not confirmed off
+        self._powered = frozenset[int]()  # ids whose torque came on and has not been confirmed off
         self._forget_silence()
 
     def _forget_silence(self) -> None:
-        self._lost = False  # the port, which was open
+        self._lost = False  # the port was open and is gone
         self._tried_s = -math.inf
         self._answered_s: float | None = None
 
-    # --- what a subclass defines --------------------------------------------------------------------------------
+    # --- methods that a subclass defines ------------------------------------------------------------------------
 
     @abstractmethod
     def _open(self) -> L:
@@ -181,14 +181,14 @@ class WireBus(ABC, Generic[L]):
 
     @abstractmethod
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
-        """Switch torque off and confirm it, as `ports.Bus`."""
+        """Switch torque off and confirm it, see `ports.Bus`."""
 
-    # --- what all do --------------------------------------------------------------------------------------------
+    # --- methods of all buses -----------------------------------------------------------------------------------
 
     def poll(self, now_s: float) -> Readings:
-        """Return what is known of every joint, after one poll's share of requests.
+        """Make the requests of one poll; return the latest reading of every joint.
 
-        Raises BusError if no servo has answered for so long that the bus has failed.
+        Raises BusError if the bus has failed: no servo has answered for `_reconnect_s`.
         """
         if self._lost:
             self._reopen(now_s)
@@ -199,7 +199,7 @@ class WireBus(ABC, Generic[L]):
                     self._answered_s = now_s
             except BusError as error:
                 self._lose(error, now_s)
-            except (ServoError, PacketError) as error:  # about one servo or one packet: the port is there
+            except (ServoError, PacketError) as error:  # the error concerns one servo or one packet; the port works
                 self._count_error(error)
         if self._answered_s is None:
             self._answered_s = now_s
@@ -240,7 +240,7 @@ class WireBus(ABC, Generic[L]):
             return None
 
     def _check(self, enabled: bool) -> None:
-        """Raise BusError before `connect`, ValueError before `enable`."""
+        """Raise BusError before `connect`, or ValueError before `enable`."""
         if not self._lost:
             self._connected()
         if not enabled:

@@ -1,13 +1,13 @@
 """Several buses as one, addressed by joint in the order of the head.
 
-In real time each of several buses has its own writer thread and rate, so that one at 9600 baud does not delay the
-others. In virtual time they take turns, and a run is the same every time.
+In real time each of several buses has its own writer thread and rate, so that a bus at 9600 baud does not delay the
+others. In virtual time the buses take turns, and a run is the same every time.
 
-A bus that has failed is reported once, by `poll`, and left out from then on; the others continue. Torque off reaches
-all.
+A bus that has failed is reported once, by `poll`, and left out from then on; the others continue. Torque off is sent to
+all buses.
 
-Goals are limited once, at the rate of the loop, and a slower bus sends every k-th of them. Those keep the limits at its
-own rate too: finite differences of a curve are averages of its derivatives, however far apart the samples are.
+Goals are limited once, at the rate of the loop, and a slower bus sends every k-th of them. These goals keep the limits
+also at the rate of that bus: finite differences of a curve are averages of its derivatives, for any sample interval.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from sfms_robot.processes import start_thread
 
 log = logging.getLogger(__name__)
 
-_TICK_S: Final = 0.1  # of `stop`, for the tick that a writer is in, and for sending torque off
+_TICK_S: Final = 0.1  # share of `stop` for ticks in progress in the writers, and for sending torque off
 FAILED: Final = "bus failed"
 
 
 class Writer:
-    """A thread for one bus, from construction until `close`. `readings` raises what ended it.
+    """A thread for one bus, from construction until `close`. `readings` raises the exception that ended it.
 
-    The newest goals win: goals that come while a write is in progress replace one another. Nothing is sent that the
-    loop did not ask for: if the loop stops, so does the wire, and the servos' watchdogs see it.
+    Only the newest goals are sent: goals that arrive while a write is in progress replace one another. Nothing is sent
+    without new goals from the loop: if the loop stops, the wire falls silent and the servos' watchdogs react.
 
     Args:
         bus: enabled; no other thread may use it meanwhile, except for `torque_off`.
-        rate_hz: ticks of the bus, however often goals come.
+        rate_hz: highest rate of ticks of the bus, for any rate of goals.
     """
 
     def __init__(self, bus: Bus, rate_hz: float) -> None:
@@ -63,9 +63,9 @@ class Writer:
             self._changed.notify()
 
     def readings(self, now_s: float) -> Readings:
-        """Return the last readings, older by the time since; empty before the first tick of the bus.
+        """Return the last readings, with their ages at `now_s`; empty before the first tick of the bus.
 
-        Raises what ended the thread, if anything did.
+        Raises the exception that ended the thread, if there is one.
         """
         with self._changed:
             if self._failure is not None:
@@ -79,13 +79,13 @@ class Writer:
         return out
 
     def end(self) -> None:
-        """Send nothing more, without waiting for the tick in progress. Idempotent."""
+        """Make the thread end after the tick in progress, without waiting for it. Idempotent."""
         with self._changed:
             self._closing = True
             self._changed.notify()
 
     def close(self, timeout_s: float) -> bool:
-        """Call `end` and wait for the tick in progress, `timeout_s` at most; return whether it is over. Idempotent."""
+        """Call `end` and wait at most `timeout_s` for the thread; return whether it has ended. Idempotent."""
         self.end()
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
@@ -95,7 +95,7 @@ class Writer:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._closing or self._goals is not None)
-                # Not before its time; goals that come meanwhile replace these.
+                # Wait until the tick is due; goals that arrive meanwhile replace these.
                 self._changed.wait_for(lambda: self._closing, timeout=max(0.0, due_s - time.monotonic()))
                 if self._closing or self._goals is None:
                     return
@@ -104,7 +104,7 @@ class Writer:
             try:
                 self._bus.write(goals, now_s)
                 readings = self._bus.poll(now_s)
-            except Exception as error:  # raised again in the loop's thread, whatever it is
+            except Exception as error:  # any exception is raised again in the loop's thread
                 with self._changed:
                     self._failure = error
                 return
@@ -119,7 +119,7 @@ class CompositeBus:
     Args:
         buses: by name; together they have exactly `joints`.
         joints: the order of `goals_rad`.
-        rates_hz: rate of each bus, which then runs in a thread from the first goal on. None: all in turn.
+        rates_hz: rate of each bus, which then runs in a thread from the first goal on. None: all buses run in turn.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class CompositeBus:
         self._writers: dict[str, Writer] = {}
         self._stops: list[threading.Thread] = []
         self._failures: dict[str, Exception] = {}  # by bus
-        self._unreported: list[str] = []  # of them, those that `poll` has to raise
+        self._unreported: list[str] = []  # failed buses that `poll` has yet to report
         place = {joint: i for i, joint in enumerate(joints)}
         self._places = {name: np.array([place[j] for j in bus.joints], np.intp) for name, bus in buses.items()}
 
@@ -143,7 +143,7 @@ class CompositeBus:
         return {joint: what for bus in self._buses.values() for joint, what in bus.capabilities.items()}
 
     def connect(self) -> None:
-        """Connect all; if one fails, those already open are closed again."""
+        """Connect all buses; if one fails, close all that are already open."""
         self._failures.clear()
         self._unreported.clear()
         try:
@@ -154,9 +154,9 @@ class CompositeBus:
             raise
 
     def enable(self, joints: Sequence[str]) -> Doubles:
-        """Enable joints as `ports.Bus`, one bus after the other, for supplies that cannot start many at once.
+        """Enable joints, see `ports.Bus`: one bus after the other, for supplies that cannot start many servos at once.
 
-        A bus that has a thread continues in a new one. Joints of a bus that has failed count as absent.
+        The thread of a bus is ended first; the next goals start a new one. Joints of a failed bus count as absent.
         """
         held = dict.fromkeys(joints, 0.0)
         for name, bus in self._working():
@@ -166,7 +166,7 @@ class CompositeBus:
         return np.array([held[joint] for joint in joints])
 
     def write(self, goals_rad: Doubles, now_s: float) -> None:
-        """Write to all buses that work. What fails in a thread is raised by `poll`."""
+        """Write to all buses that work. `poll` raises an exception of a thread."""
         if not np.isfinite(goals_rad).all():
             raise ValueError(f"goal of {self.joints[int(np.argmin(np.isfinite(goals_rad)))]} is not finite")
         refused: ValueError | None = None
@@ -181,7 +181,7 @@ class CompositeBus:
                 self._writers[name].put(goals, now_s)
             except ValueError as error:  # the other buses still get their goals
                 refused = refused or error
-            except Exception as error:  # whatever it is, it concerns this bus alone
+            except Exception as error:  # any other exception concerns this bus alone
                 self._fail(name, error)
         if refused is not None:
             raise refused
@@ -203,32 +203,33 @@ class CompositeBus:
         return readings
 
     def release(self, joints: Sequence[str]) -> None:
-        """Release joints as `ports.Bus`, on every bus that works, from the caller's thread."""
+        """Release joints, see `ports.Bus`, on every bus that works, from the caller's thread."""
         for _, bus in self._working():
             bus.release([joint for joint in joints if joint in bus.joints])
 
     def resume(self, joints: Sequence[str]) -> None:
-        """Bring joints back as `ports.Bus`, on every bus that works."""
+        """Bring joints back, see `ports.Bus`, on every bus that works."""
         for _, bus in self._working():
             bus.resume([joint for joint in joints if joint in bus.joints])
 
     def torque_off(self, policy: StopPolicy) -> None:
-        """Send torque off as `ports.Bus`, on every bus, from the caller's thread."""
+        """Send torque off, see `ports.Bus`, on every bus, from the caller's thread."""
         for bus in self._buses.values():
             bus.torque_off(policy)
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
-        """Send torque off on all buses, whatever their writers are doing; then let each bus confirm it.
+        """Send torque off on all buses without waiting for their writers; then let each bus confirm it.
 
-        Buses with threads confirm at the same time, others one after the other, each in its share of the time. Never
-        raises; blocks `within_s` at most, with threads also for a bus that hangs in a system call.
+        If a writer does not end, the other buses confirm at the same time, in threads. Otherwise all buses confirm one
+        after the other, each in its share of the time. Never raises; blocks `within_s` at most, with threads also if a
+        bus hangs in a system call.
         """
         began_s = time.monotonic()
         for writer in self._writers.values():
             writer.end()
         self.torque_off(policy)
         free = {name: self._buses[name] for name in self._buses if self._ended(name, began_s + _TICK_S)}
-        for thread in self._stops:  # of a call that an interrupt cut short: a bus has one user at a time
+        for thread in self._stops:  # left from an interrupted call of `stop`: only one thread may use a bus
             thread.join(max(0.0, began_s + within_s - time.monotonic()))
         if self._rates_hz is None or not self._writers:
             for bus in free.values():
@@ -243,7 +244,7 @@ class CompositeBus:
                 log.warning("bus %r: does not confirm in time that its torque is off", name)
 
     def _ended(self, name: str, until_s: float) -> bool:
-        """Return whether no thread uses the bus any more."""
+        """End the writer of a bus, waiting until `until_s` at most; return whether no thread uses the bus any more."""
         writer = self._writers.get(name)
         if writer is None or writer.close(max(0.0, until_s - time.monotonic())):
             self._writers.pop(name, None)
@@ -252,7 +253,7 @@ class CompositeBus:
         return False
 
     def close(self) -> None:
-        """Close all ports. Blocks for the tick that a writer is in, `STOP_S` at most."""
+        """Close all ports. Blocks for the ticks in progress in the writers, `STOP_S` at most."""
         until_s = time.monotonic() + STOP_S
         for writer in self._writers.values():
             writer.end()
@@ -261,7 +262,7 @@ class CompositeBus:
             bus.close()
 
     def statistics(self) -> Facts:
-        """Return totals, and the statistics of each bus under `buses`."""
+        """Return totals, and under `buses` the statistics of each bus."""
         each = {name: dict(bus.statistics()) for name, bus in self._buses.items()}
         total: Report = {"torque_unconfirmed": []}
         for counts in each.values():

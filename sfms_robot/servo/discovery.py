@@ -1,8 +1,8 @@
-"""Which serial ports there are, which processes hold them, how long their adapters hold bytes back; and `--port`.
+"""Serial ports of this system, the processes that hold them, and the latency of their adapters; and option `--port`.
 
-No port is opened. The list and the USB adapters come from pyserial, which knows macOS and Windows too, and the ports of
-built-in UARTs from /dev; names, drivers and holders come from /dev, /sys and /proc. Tests pass a list and a root of
-their own.
+No port is opened. The list and the USB adapters come from pyserial, which supports macOS and Windows too, and the ports
+of built-in UARTs from /dev; names, drivers and holders come from /dev, /sys and /proc. Tests pass their own list and
+root.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from sfms_robot.data import Report
 from sfms_robot.endpoint import host_and_port
 from sfms_robot.errors import ConfigError, PortError
 
-ROOT: Final = Path("/")  # of /dev, /sys and /proc
+ROOT: Final = Path("/")  # parent of /dev, /sys and /proc
 AUTO: Final = "auto"
-NETWORKED: Final = ("socket", "rfc2217")  # pyserial's URLs that can lead to servos
+NETWORKED: Final = ("socket", "rfc2217")  # schemes of pyserial's URLs that can lead to servos
 
 _PATTERNS: Final = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "ttySC*", "ttyS*", "rfcomm*", "serial[0-9]")
-_TAKERS: Final = {  # daemons that look for their own devices on every USB port
+_TAKERS: Final = {  # daemons that search every USB port for their own devices
     "ModemManager": "sends modem commands to every port that is plugged in",
     "brltty": "takes adapters with a CH340 or CP210x for a braille display, and their port vanishes",
 }
-_NO_UART: Final = "0"  # /sys/class/tty/ttyS0/type, PORT_UNKNOWN: the name is there, the hardware is not
-_NAMED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*=")  # a bus and its device; addresses and paths do not begin so
+_NO_UART: Final = "0"  # /sys/class/tty/ttyS0/type, PORT_UNKNOWN: a name without hardware
+_NAMED: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*=")  # BUS=DEVICE; addresses and paths do not begin like this
 
 
 @dataclass(frozen=True)
 class SerialDevice:
-    """A serial port. None stands for what the adapter does not report.
+    """A serial port. Values that the adapter does not report are None.
 
     Attributes:
-        path: device file, as in /dev/ttyUSB0.
-        by_id: its name by maker and serial number, as in /dev/serial/by-id/usb-FTDI_..., if there is one.
-        by_path: its name by the socket it is plugged into, as in /dev/serial/by-path/..., if there is one.
+        path: device file. Example: /dev/ttyUSB0.
+        by_id: its name by maker and serial number, such as /dev/serial/by-id/usb-FTDI_..., if there is one.
+        by_path: its name by the socket it is plugged into, such as /dev/serial/by-path/..., if there is one.
         vendor, product: USB numbers, four hex digits each.
         serial: USB serial number.
         driver: kernel driver. Example: ftdi_sio.
-        latency_ms: how long the adapter collects bytes before it hands them over.
-        latency_file: where that is set.
+        latency_ms: time for which the adapter collects bytes before it delivers them.
+        latency_file: file in which `latency_ms` is set.
     """
 
     path: str
@@ -69,7 +69,7 @@ class Holder:
     command: str
 
 
-Listing = Callable[[], Iterable[Any]]  # of pyserial's `ListPortInfo`s
+Listing = Callable[[], Iterable[Any]]  # returns pyserial's `ListPortInfo` objects
 
 
 def _pyserial_ports() -> Iterator[Any]:
@@ -79,9 +79,9 @@ def _pyserial_ports() -> Iterator[Any]:
 
 
 def list_ports(root: Path = ROOT, listed: Listing = _pyserial_ports) -> list[SerialDevice]:
-    """Return the serial ports that servos may be connected to, by path; no built-in ttyS without hardware.
+    """Return the serial ports that servos may be connected to, by path, without built-in ttyS that have no hardware.
 
-    `listed`: returns pyserial's `ListPortInfo` of each port, from which come the facts of USB adapters.
+    `listed`: returns pyserial's `ListPortInfo` of each port, the source of the facts of USB adapters.
     """
     found: dict[str, Any] = {_real(str(path)): None for pattern in _PATTERNS for path in (root / "dev").glob(pattern)}
     found |= {_real(port.device): port for port in listed()}
@@ -93,7 +93,7 @@ def list_ports(root: Path = ROOT, listed: Listing = _pyserial_ports) -> list[Ser
 
 
 def ports_data() -> list[Report]:
-    """Return the rows of `port list` as plain data: the facts, `name` to give to --port, `problem` and `holders`."""
+    """Return the rows of `port list` as plain data: the facts, the `name` for --port, `problem` and `holders`."""
     return [
         {
             "name": stable_name(port.path),
@@ -106,13 +106,13 @@ def ports_data() -> list[Report]:
 
 
 def describe(path: str, root: Path = ROOT, listed: Listing = _pyserial_ports) -> SerialDevice:
-    """Return what the system knows of a port; `path` may be a link to it."""
+    """Return the facts that the system has about a port; `path` may be a link to it."""
     real = _real(path)
     return _described(real, next((port for port in listed() if _real(port.device) == real), None), root)
 
 
 def _described(path: str, port: Any, root: Path) -> SerialDevice:
-    """Return a port with its names and driver, and what pyserial says of it; `port` None: it does not know it."""
+    """Return a port with its names and driver, and the facts in `port` (None: pyserial does not list the port)."""
     name, links, sys = os.path.basename(path), root / "dev" / "serial", root / "sys"
     driver = sys / "class" / "tty" / name / "device" / "driver"
     latency = sys / "bus" / "usb-serial" / "devices" / name / "latency_timer"
@@ -136,14 +136,15 @@ def _described(path: str, port: Any, root: Path) -> SerialDevice:
 def stable_name(device: str, root: Path = ROOT, listed: Listing = _pyserial_ports) -> str:
     """Return the name under which an adapter is found again after it was unplugged, or `device` itself.
 
-    That is by serial number if the adapter has a unique one. Two CH340 have none, and two CP2102 both have 0001: their
-    by-id names are equal, and the link points to the one plugged in last. Such adapters are named by their USB socket.
+    It is the name by serial number if the adapter has a unique one. Two CH340 have no serial number, and two CP2102
+    both have 0001: their by-id names are equal, and the link points to the adapter that was plugged in last. Such
+    adapters are named by their USB socket.
     """
     links = root / "dev" / "serial"
     if not device.startswith((str(root / "dev" / "tty"), str(links / "by-id"))):
         return device
     real = _real(device)
-    sockets: dict[tuple[Any, ...], set[str]] = {}  # USB sockets by numbers; ports of one adapter share its socket
+    sockets: dict[tuple[Any, ...], set[str]] = {}  # USB sockets by `numbers`; ports of one adapter share its socket
     own: tuple[Any, ...] = ()
     for port in listed():
         numbers = port.vid, port.pid, port.serial_number
@@ -155,13 +156,13 @@ def stable_name(device: str, root: Path = ROOT, listed: Listing = _pyserial_port
 
 
 def holders(path: str, root: Path = ROOT) -> list[Holder]:
-    """Return the processes that have the port open, as far as this user may see; this one is left out."""
+    """Return the other processes that have the port open, as far as this user is allowed to see them."""
     real, others = os.path.realpath(path), [each for each in _processes(root) if int(each.name) != os.getpid()]
     return [Holder(int(folder.name), _command(folder)) for folder in others if real in _open_files(folder)]
 
 
 def rivals(path: str, root: Path = ROOT) -> list[tuple[str, str]]:
-    """Return what else uses a port, or takes it when it is plugged in: in words, with the command that frees it."""
+    """Return programs that use a port, or take it when it is plugged in, each in words with the command to free it."""
     name, found = os.path.basename(os.path.realpath(path)), []
     if name in (_line(root / "sys" / "class" / "tty" / "console" / "active") or "").split():
         fix = (
@@ -180,7 +181,7 @@ def rivals(path: str, root: Path = ROOT) -> list[tuple[str, str]]:
 
 
 def is_address(device: str) -> bool:
-    """Return whether a device is a URL, socket://, rfc2217:// and the like; all others are paths."""
+    """Return whether a device is a URL (socket://, rfc2217:// and similar); every other device is a path."""
     return "://" in device
 
 
@@ -206,7 +207,7 @@ def access_problem(path: str) -> str | None:
 
 
 def _meant(path: str) -> str:
-    """Return how to write what a path that does not exist was probably meant to be."""
+    """Return a hint on how to write the device that was probably meant by a path that does not exist."""
     if ":" in path and host_and_port(path) is not None:
         return f"; the port of a serial server is written socket://{path}"
     if path and (device := ROOT / "dev" / path).exists():
@@ -215,7 +216,7 @@ def _meant(path: str) -> str:
 
 
 def check_device(device: str, flag: str = "") -> None:
-    """Raise PortError, with what to do, for what cannot be a serial port; nothing is opened. `flag`: in front of it."""
+    """Raise PortError, with a remedy, if `device` cannot be a serial port; open nothing. `flag`: text prefix."""
     problem = access_problem(device)
     if problem is None:
         return
@@ -228,7 +229,7 @@ def check_device(device: str, flag: str = "") -> None:
 
 
 def _address_problem(url: str) -> str | None:
-    """Return what an address lacks; no connection is tried."""
+    """Return the problem of an address, None if it is complete; no connection is tried."""
     scheme = url.partition("://")[0]
     if scheme not in NETWORKED:
         choices = ", ".join(f"{each}://HOST:PORT" for each in NETWORKED)
@@ -236,7 +237,7 @@ def _address_problem(url: str) -> str | None:
     try:
         parts = urlsplit(url)
         complete = bool(parts.hostname) and parts.port is not None
-    except ValueError:  # a port that is not a number, or out of range
+    except ValueError:  # the port is not a number, or is out of range
         complete = False
     return None if complete else f"names no host and port to connect to ({scheme}://HOST:PORT)"
 
@@ -250,7 +251,7 @@ def group_of(path: str) -> str:
 
 
 def _real(device: str) -> str:
-    """Return a path without links; a COM port is not a path."""
+    """Return a path without links; on Windows return the device unchanged, since a COM port is not a path."""
     return os.path.realpath(device) if os.name == "posix" else device
 
 
@@ -259,7 +260,7 @@ def _link_to(real: str, folder: Path) -> str | None:
 
 
 def _processes(root: Path) -> list[Path]:
-    """Return the folder of every process, by its id."""
+    """Return the folder of every process, in the order of their ids."""
     return sorted((root / "proc").glob("[0-9]*"), key=lambda each: int(each.name))
 
 
@@ -267,7 +268,7 @@ def _open_files(folder: Path) -> Iterator[str]:
     try:
         entries = os.listdir(folder / "fd")
     except OSError:
-        return  # the process ended, or belongs to another user
+        return  # the process has ended, or belongs to another user
     for entry in entries:
         try:
             yield os.readlink(folder / "fd" / entry)
@@ -291,11 +292,11 @@ def _line(file: Path) -> str | None:
         return None
 
 
-# --- the text of --port ---------------------------------------------------------------------------------------------
+# --- values of --port -----------------------------------------------------------------------------------------------
 
 
 def parse_ports(buses: Collection[str], text: str) -> dict[str, str]:
-    """Return the device of each bus from `DEVICE`, for a head of one bus, or `BUS=DEVICE[,BUS=DEVICE]`.
+    """Return the device of each bus. `text` is `DEVICE` for a head of one bus, or `BUS=DEVICE[,BUS=DEVICE]`.
 
     Raises ConfigError for a bus that is missing, unknown or given twice, and for a device that two buses share.
     """
@@ -317,9 +318,9 @@ def parse_ports(buses: Collection[str], text: str) -> dict[str, str]:
 
 
 def choose_ports(buses: Collection[str], ports: Sequence[SerialDevice]) -> dict[str, str]:
-    """Return for `--port auto` the one USB adapter of `ports` as the device of the one bus.
+    """Return the device of the bus for `--port auto`: the only USB adapter in `ports`.
 
-    Raises PortError without an adapter, and ConfigError naming the adapters if there is a choice.
+    Raises PortError without an adapter, and ConfigError that lists the adapters if there is a choice.
     """
     adapters = [port.path for port in ports if port.vendor is not None]
     if not adapters:

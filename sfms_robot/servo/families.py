@@ -1,7 +1,7 @@
 """The table of bus families: the class that drives each, and its name in the tools. Classes are imported on use.
 
-Another package adds a family by an entry point of the group `sfms_robot.buses` (`plugins`): its name is the family's,
-its value loads a `BusFamily`.
+Another package adds a family by an entry point of the group `sfms_robot.buses` (`plugins`). The name of the entry point
+is the name of the family, and its value loads a `BusFamily`.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ class BusFamily:
     """Servos, or boards of servos, that are driven by one class.
 
     Attributes:
-        title: the name for people.
+        title: name shown to users.
         bus: "module:class" of its `ports.Bus`, called with (name, servos, conversion, open_port, baud, read_deadline_s)
-            and `config`; servos also with `faults`, a board with `confirmed` and `rest_rad` (see `PulseBus`).
+            and `config`; for servos also with `faults`, for a board with `confirmed` and `rest_rad` (see `PulseBus`).
         maps: (family, protocol) of its firmware maps; the protocol is None for a board.
-        link: "module:class" of the `RegisterLink` of its tools, called with (port, baud, silence_s); None for a board,
-            whose servos have no registers, and for servos that the tools do not support.
+        link: "module:class" of the `RegisterLink` that the tools use, called with (port, baud, silence_s); None for a
+            board, whose servos have no registers, and for servos that the tools do not support.
         bauds: bits per second that its servos may be set to, the most frequent first.
         max_id: highest id of a servo.
         broadcast: whether one ping reaches all servos.
@@ -52,13 +52,13 @@ class BusFamily:
 
     @property
     def protocol(self) -> int:
-        """Return 1 or 2. Raises ConfigError for a board."""
+        """Return the servo protocol, 1 or 2. Raises ConfigError for a board."""
         if self.maps[1] is None:
             raise ConfigError(f"{self.title}: a board speaks no servo protocol")
         return self.maps[1]
 
     def build(self, *arguments: Any, **more: Any) -> Any:
-        """Return its bus, made of these arguments; the class itself without any. Raises ConfigError (`plug_in`)."""
+        """Return its bus, constructed with the arguments; without any, its class. Raises ConfigError (`plug_in`)."""
         return plug_in(EntryPoint(self.title, self.bus, BUS_GROUP), *arguments, **more)
 
     def link_class(self) -> Any:
@@ -103,7 +103,7 @@ _OWN: Final = {
 
 @cache
 def families() -> Mapping[str, BusFamily]:
-    """Return all families by name: our own, then those of other packages. One that fails is logged and left out."""
+    """Return all families by name: our own, then those of other packages. A failed plug-in is logged and left out."""
     found = dict(_OWN)
     for name, entry in plugins(BUS_GROUP).items():
         try:
@@ -124,14 +124,14 @@ def _family_of(entry: EntryPoint) -> BusFamily:
 
 
 def servo_families() -> Mapping[str, BusFamily]:
-    """Return the families that have a link, by name: those that the servo tools support."""
+    """Return the families that the servo tools support (those with a link), by name."""
     return {name: family for name, family in families().items() if family.link is not None}
 
 
 def family_named(name: str) -> BusFamily:
     """Return a family by its name.
 
-    Raises ConfigError with the choices, or with the error of the plug-in that brings it.
+    Raises ConfigError with the valid names, or with the error of the plug-in that defines it.
     """
     known = families()
     if name not in known:

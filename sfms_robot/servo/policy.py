@@ -1,7 +1,7 @@
-"""Limits of a joint's servo, and the faults and loads that are acted upon. Decided without a wire.
+"""Limits of a joint's servo, and the rules that decide which faults and loads are acted upon. No I/O.
 
 A servo reports faults as bits. Not all of them matter: a head that runs at 7.2 V has the voltage fault set all the
-time. So the head's file may mask a fault, or set a threshold outside which it counts.
+time. So the head's file may mask a fault, or set a threshold: the fault counts only outside of it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Final
 from sfms_robot.config import Faults, LoadRule, Safety
 from sfms_robot.servo.registers import Field, Table
 
-PINCH_SHARE: Final = 0.6  # of the servo's own current limit
+PINCH_SHARE: Final = 0.6  # share of the servo's own current limit
 PINCH_S: Final = 0.5
 
 
@@ -22,7 +22,7 @@ class BusServo:
     """A servo of a bus and the joint it moves; the limits are those of the joint.
 
     Attributes:
-        doctor: command that corrects what the servo stores against the head's file.
+        doctor: command that corrects the stored settings of the servo to match the head's file.
     """
 
     joint: str
@@ -38,7 +38,7 @@ class BusServo:
 
     @property
     def calibrate(self) -> str:
-        """Return the command that measures this joint, on the port and for the head of `doctor`."""
+        """Return the command that measures this joint, with the port and the head of `doctor`."""
         words = self.doctor.replace(" doctor ", " head calibrate ", 1).replace(" --head ", " ", 1)
         return f"{words.removesuffix(' --fix')} --joint {self.joint}"
 
@@ -51,7 +51,7 @@ class BusServo:
 def counts(name: str, faults: Faults, measured: Mapping[str, float | None]) -> bool:
     """Return whether fault `name` is acted upon.
 
-    `measured`: by fault, the value that its threshold is compared with. A fault whose value is not known yet counts.
+    `measured`: the value that is compared with the threshold, by fault. A fault whose value is not known yet counts.
     """
     threshold, value = faults.thresholds.get(name), measured.get(name)
     if name in faults.mask:
@@ -70,7 +70,7 @@ def tells_current(table: Table) -> bool:
 
 
 def torque_register(table: Table) -> Field | None:
-    """Return the register, in percent, that bounds the torque; the PWM if the model has no other.
+    """Return the register, in percent, that bounds the torque: `torque_limit`, or `goal_pwm` if the model has no other.
 
     Both bound the voltage at the motor, so the torque of a stalled servo falls in proportion.
     """
@@ -87,7 +87,7 @@ def torque_limit(servo: BusServo) -> dict[str, int]:
 
 
 def load_rules(servo: BusServo) -> list[tuple[str, LoadRule]]:
-    """Return the named load rules of a joint; none if its servo does not report its current."""
+    """Return the named load rules of a joint; empty if its servo does not report its current."""
     if not tells_current(servo.table):
         return []
     pinch, limit = servo.safety.pinch, servo.table.fields.get("current_limit")

@@ -1,15 +1,17 @@
-"""Serial ports: what a bus reads from and writes to.
+"""Serial ports, which buses read from and write to.
 
-`SerialPort` is a real port: a read blocks until bytes come or a deadline passes. It belongs to one program: two on one
-wire take each other's answers, so a port that another process holds is refused, to root too. Every baud rate that the
-adapter can do is allowed. If the driver offers it, bytes are handed over without the usual 16 ms wait.
+`SerialPort` is a real port: a read blocks until bytes come or a deadline passes. It belongs to one program. Two
+programs on one wire take each other's answers, so a port that another process holds is refused, for root too. Every
+baud rate that the adapter supports is allowed. If the driver supports it, bytes are delivered without the usual wait of
+16 ms.
 
-What differs between operating systems about an open device (waiting, exclusive use, rates, RS-485 direction) is at the
-end of this file. `fcntl` and `termios` are imported if the system has them, so that the package imports everywhere.
+The code that depends on the operating system (waiting, exclusive use, rates, RS-485 direction of an open device) is at
+the end of this file. `fcntl` and `termios` are imported if the system has them, so that the package can be imported on
+every system.
 
-`VirtualTimePort` is the same port for emulated servos in virtual time. Bytes pass over the same device, but
-before a read the port sends the emulator, on a control socket, the number of bytes written so far and the time. The
-emulator takes exactly those bytes, moves its servos to that time, sends the length of its reply and writes it. So the
+`VirtualTimePort` is the same port for emulated servos in virtual time. Bytes pass over the same device, but before a
+read the port sends the number of bytes written so far and the time to the emulator, on a control socket. The emulator
+reads exactly those bytes, moves its servos to that time, sends the length of its reply and writes the reply. So the
 result does not depend on scheduling, and a silence takes no real time.
 """
 
@@ -41,8 +43,8 @@ log = logging.getLogger(__name__)
 
 Rs485 = Literal["rts", "kernel"]
 
-WRITE_TIMEOUT_S: Final = 0.5  # a device that takes no bytes for so long counts as gone, and stopping must not wait
-_REPLY_TIMEOUT_S: Final = 30.0  # real seconds: a stopped emulator, or one that waits for its turn on a busy machine
+WRITE_TIMEOUT_S: Final = 0.5  # a device that accepts no bytes for so long counts as gone; a stop must not wait longer
+_REPLY_TIMEOUT_S: Final = 30.0  # real seconds, for a stopped emulator or one that waits for a busy processor
 _TERMINALS: Final = "/dev/pts/"
 _BAUD_TOLERANCE: Final = 0.03  # an asynchronous receiver samples the middle of the tenth bit
 _POLL_S: Final = 0.0005
@@ -75,16 +77,16 @@ class Port(Protocol):
         """Return 1 to `n` bytes as soon as there are any; empty if none came by `deadline_s` of `now_s`."""
 
     def discard_input(self) -> None:
-        """Drop bytes that came and were not read."""
+        """Drop bytes that have arrived and were not read."""
 
     def now_s(self) -> float:
         """Return the time of the port's clock."""
 
     def wait_until(self, time_s: float) -> None:
-        """Let time pass until `time_s` of `now_s`."""
+        """Wait until `now_s` is `time_s`."""
 
     def set_baud(self, baud: int) -> None:
-        """Change the rate. Raises PortError if the adapter cannot do it."""
+        """Change the rate. Raises PortError if the adapter does not support it."""
 
     def close(self) -> None:
         """Close the device. Idempotent."""
@@ -129,10 +131,10 @@ class SerialPort:
     """A serial device: a path, a name such as COM3, socket://HOST:PORT or rfc2217://HOST:PORT.
 
     Args:
-        rs485: what switches the direction of a half-duplex RS-485 driver: this program by the RTS line, or the kernel;
-            None if the adapter does it.
+        rs485: method to switch the direction of a half-duplex RS-485 driver: "rts": this program, by the RTS line;
+            "kernel": the kernel; None: the adapter.
 
-    The constructor opens the device. Raises PortError of one line; the device is closed then.
+    The constructor opens the device. If it raises PortError (one line), the device is closed again.
     """
 
     def __init__(self, device: str, baud: int, clock: Clock, rs485: Rs485 | None = None) -> None:
@@ -199,13 +201,13 @@ def emulator_control(control: str) -> socket.socket:
 class VirtualTimePort:
     """The device of an emulated chain, in virtual time; `control`: address of its control socket."""
 
-    _WINDOW = 2048  # bytes under way at most: more than a terminal holds would block for ever
+    _WINDOW = 2048  # most bytes in transit; more bytes than the buffer of a terminal holds would block for ever
 
     def __init__(self, device: str, control: str, baud: int, clock: Clock) -> None:
         self.name = device
         self.now_s, self.wait_until = clock.now_s, clock.wait_until
         self._written = 0
-        self._announced = 0  # of them, those that the emulator has taken
+        self._announced = 0  # bytes that the emulator has read, of those written
         self._wanted_from = 0
         self._written_at_s = 0.0
         self._inbox = bytearray()
@@ -217,7 +219,7 @@ class VirtualTimePort:
             self._control.close()
             raise
         self._io = serial_io(self._serial, device)
-        self._serial.write_timeout = _REPLY_TIMEOUT_S  # real time, which says nothing here about the device
+        self._serial.write_timeout = _REPLY_TIMEOUT_S  # real time, which here does not show a lost device
 
     def write(self, data: bytes) -> None:
         now_s = self.now_s()
@@ -243,7 +245,7 @@ class VirtualTimePort:
 
     def discard_input(self) -> None:
         self._inbox.clear()
-        self._wanted_from = self._written  # answers to earlier bytes need not even be sent
+        self._wanted_from = self._written  # the emulator need not send answers to earlier bytes
 
     def set_baud(self, baud: int) -> None:
         self._announce()
@@ -259,12 +261,12 @@ class VirtualTimePort:
         self._control.close()
 
     def _announce(self) -> None:
-        """Let the emulator take what it has not taken yet, at the time of the last write."""
+        """Let the emulator read the bytes that it has not read yet, at the time of the last write."""
         if self._announced < self._written:
             self._exchange(self._written_at_s)
 
     def _exchange(self, now_s: float, until_s: float | None = None) -> None:
-        """Let the emulator take the bytes written, at `now_s`, and read all that it sends by `until_s`."""
+        """Let the emulator read the bytes written, at `now_s`, and read all bytes that it sends by `until_s`."""
         until_s = now_s if until_s is None else until_s
         try:
             self._control.sendall(b"sync %d %d %r %r\n" % (self._written, self._wanted_from, now_s, until_s))
@@ -290,7 +292,7 @@ class VirtualTimePort:
 
 
 def _open(device: str, baud: int) -> serial.Serial:
-    """Open a device. Raises PortError of one line: missing, not permitted, held by another program, not serial."""
+    """Open a device. Raises PortError (one line) if it is missing, forbidden, held by another program or not serial."""
     if is_address(device) and (problem := access_problem(device)):
         raise PortError(f"{device}: {problem}")
     import serial
@@ -300,7 +302,7 @@ def _open(device: str, baud: int) -> serial.Serial:
     except (OSError, OverflowError, ValueError) as error:
         raise PortError(f"{device}: {_reason(device, error)}") from error
     try:
-        if _is_socket(device):  # With Nagle's algorithm the goals of a tick wait for the last acknowledgement: 40 ms.
+        if _is_socket(device):  # With Nagle's algorithm the goals of a tick wait 40 ms for the last acknowledgement.
             with socket.fromfd(port.fileno(), socket.AF_INET, socket.SOCK_STREAM) as connection:
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         elif not is_address(device):
@@ -313,12 +315,12 @@ def _open(device: str, baud: int) -> serial.Serial:
 
 
 def _is_socket(device: str) -> bool:
-    """Return whether it is plain TCP, which carries bytes and no settings."""
+    """Return whether a device is plain TCP, which transfers bytes and no settings."""
     return device.startswith("socket://")
 
 
 def _shut(port: serial.Serial) -> None:
-    """Close a device. pyserial leaves the connection open where the other end has closed it first."""
+    """Close a device. pyserial leaves a connection open if the other end has closed it first."""
     connection = getattr(port, "_socket", None)
     port.close()
     if connection is not None:
@@ -326,10 +328,10 @@ def _shut(port: serial.Serial) -> None:
 
 
 def _claim(port: serial.Serial, device: str) -> None:
-    """Refuse a device that another process has open, and keep others from opening it; pyserial's lock is advice.
+    """Refuse a device that another process has open, and keep others from opening it; pyserial's lock is only advisory.
 
-    An emulator holds the near end of its pseudo terminal open, and with it the lock of a dead host: those pass.
-    Windows gives out a device once only; elsewhere root can still open it.
+    Pseudo terminals are not checked: an emulator holds the near end open, and with it the lock of a dead host. Windows
+    lets only one process open a device; on other systems root can still open it.
     """
     if os.path.realpath(device).startswith(_TERMINALS):
         return
@@ -340,7 +342,7 @@ def _claim(port: serial.Serial, device: str) -> None:
 
 
 def _check_baud(port: serial.Serial, device: str) -> None:
-    """Raise PortError if the driver set another rate; drivers take the nearest they can do, and only Linux says it."""
+    """Raise PortError if the driver set another rate: drivers use the nearest, and only Linux reports it."""
     if _fcntl is None or sys.platform != "linux":
         return
     settings = array("I", [0] * 64)
@@ -370,12 +372,12 @@ def _held(others: Sequence[Holder]) -> str:
 
 
 class DescriptorIO:
-    """By file descriptor, on Linux and macOS: it wakes with the first byte; pyserial's own calls wait in a loop.
+    """Input and output by file descriptor (Linux, macOS). It wakes at the first byte; pyserial's calls wait in a loop.
 
     Like the two classes below it raises one of `DEVICE_ERRORS` if the device is gone.
 
     Args:
-        connection: of a network port, which Windows waits for and reads in the same way.
+        connection: socket of a network port; on Windows it is waited for and read in the same way.
     """
 
     def __init__(self, port: serial.Serial, connection: socket.socket | None) -> None:
@@ -384,7 +386,7 @@ class DescriptorIO:
         self._give = partial(os.write, self._fd) if connection is None else connection.send
 
     def write(self, data: bytes) -> None:
-        """Send all of `data`; blocks at most `WRITE_TIMEOUT_S` for a device that takes no bytes."""
+        """Send all of `data`; block at most `WRITE_TIMEOUT_S` for a device that accepts no bytes."""
         rest = memoryview(data)
         while rest:
             try:
@@ -403,9 +405,9 @@ class DescriptorIO:
 
 
 class PolledIO:
-    """By pyserial's own calls, twice a millisecond, for devices without a descriptor (Windows, rfc2217://).
+    """Input and output by pyserial's calls, twice a millisecond, for devices without descriptor (Windows, rfc2217://).
 
-    `port` was opened with timeout 0 and `WRITE_TIMEOUT_S`.
+    `port` must have been opened with timeout 0 and write timeout `WRITE_TIMEOUT_S`.
     """
 
     def __init__(self, port: serial.Serial) -> None:
@@ -426,8 +428,8 @@ class PolledIO:
 class RtsDirection:
     """A half-duplex RS-485 driver that transmits while RTS is on: on before the first bit, off after the last.
 
-    `flush` returns when the bytes have left (tcdrain). With an adapter that buffers behind its driver it returns too
-    early: most of those switch the direction themselves and need no `rs485`.
+    `flush` returns when the bytes have left (tcdrain). It returns too early with an adapter that has its own buffer:
+    most such adapters switch the direction themselves and need no `rs485`.
     """
 
     def __init__(self, inner: DescriptorIO | PolledIO, port: serial.Serial, name: str) -> None:
@@ -449,7 +451,7 @@ class RtsDirection:
 
 
 def serial_io(port: serial.Serial, name: str, rs485: Rs485 | None = None) -> DescriptorIO | PolledIO | RtsDirection:
-    """Return the kind of this system and device. Raises PortError if it cannot switch the direction as `rs485` says."""
+    """Return the I/O for this system and device. Raises PortError if it cannot switch the direction as in `rs485`."""
     if rs485 == "kernel":  # TIOCSRS485: the driver switches the direction between the last bit and the first answer
         from serial.rs485 import RS485Settings
 

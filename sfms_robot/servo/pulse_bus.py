@@ -1,16 +1,17 @@
-"""A board of hobby servos as a bus: pulses go out, nothing comes back.
+"""A board of hobby servos as a bus: it sends pulses and receives no positions.
 
-A hobby servo does not report its position, so this bus reports none, and does not invent any. What follows:
+A hobby servo does not report its position, so this bus reports none, and does not estimate it. The consequences:
 
 1. Torque cannot come on without a jump: a servo moves to the first pulse as fast as it can. So `enable` needs the
-   user's confirmation, and switches on one channel at a time, with the pulse that the board sends already, else the
-   last goal, else the rest pose. Between channels it waits for as long as the slowest servo may take.
-2. A line may be slower than the loop: 24 channels take 0.2 s at 9600 baud. Of the goals that come while it is busy the
-   newest is sent. Only what changed is sent, and one other channel in turn, so that a lost command is repeated.
-3. Once a second the board is asked for its status; a later poll reads the answer. A silent board gets no goals, and
-   channels that it switched off meanwhile come on again one at a time, as at the start.
-4. Torque off is a latch: from `torque_off` or `stop` until the next `enable` or `resume` no pulse is sent, whichever
-   thread was about to, and a board that was away is switched off as soon as it is back.
+   user's confirmation, and switches on one channel at a time, with the pulse that the board already sends, else the
+   last goal, else the rest pose. After each channel it waits for the longest time that the servo may take.
+2. A line may be slower than the loop: 24 channels take 0.2 s at 9600 baud. Of the goals that arrive while it is busy,
+   only the newest is sent. Each time the changed channels are sent, and one other channel in turn, so that a lost
+   command is repeated.
+3. Once a second the status of the board is requested; a later poll reads the answer. A silent board receives no goals,
+   and channels that it switched off meanwhile come on again one at a time, as at the start.
+4. Torque off is a latch: from `torque_off` or `stop` until the next `enable` or `resume` no thread sends a pulse, and a
+   board that was lost is switched off as soon as it is back.
 """
 
 from __future__ import annotations
@@ -44,12 +45,12 @@ from sfms_robot.servo.port import OpenPort
 log = logging.getLogger(__name__)
 
 _CAPABILITIES: Final = frozenset({"torque"})  # pulses can be switched off, nothing more
-_TRAVEL_PARTS: Final = 14  # of that wait; after each, the latch is checked
+_TRAVEL_PARTS: Final = 14  # parts of the wait after a channel came on; the latch is checked before each
 _STATUS_EVERY_S: Final = 1.0
 _SILENT_AFTER: Final = 3  # requests without an answer
-_LEAST_PATIENCE_S: Final = 0.02  # an SSC-32 thinks for up to 5 ms, an adapter holds its bytes for up to 16
-_STOP_S: Final = 0.4  # the longest that `stop` waits for the board to confirm that its pulses are off
-_LEAST_RECONNECT_S: Final = 5.0  # a board that is asked once a second has to have a few chances
+_LEAST_PATIENCE_S: Final = 0.02  # an SSC-32 needs up to 5 ms to answer, an adapter delays its bytes by up to 16 ms
+_STOP_S: Final = 0.4  # longest wait of `stop` for the board to confirm that its pulses are off
+_LEAST_RECONNECT_S: Final = 5.0  # with one status request a second, the board has several chances to answer
 _NO_ANSWER: Final = "no answer"
 _TORQUE_LOST: Final = "torque lost"
 
@@ -62,7 +63,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         servos: in joint order; `id` is the channel.
         conversion: joint angles (J,) <-> ticks (J,) of pulse width.
         read_deadline_s: time without an answer after which a request counts as unanswered; at least 20 ms.
-        confirmed: the user knows that servos jump when their pulses come on.
+        confirmed: True if the user has confirmed that servos may jump when their pulses come on.
         rest_rad: (J,) first goals without a better one; by default 0 rad, or the end of the range nearest to it.
 
     Raises ConfigError for a channel or a pulse that the board does not have.
@@ -93,28 +94,28 @@ class PulseBus(WireBus[RateLimitedPort]):
         if wide := pulses_beyond(servos, conversion, table, self._board.factory_us):
             log.warning("bus %r: set wider limits in the Maestro itself, over USB, for %s", name, wide)
         rest = np.zeros(len(servos)) if rest_rad is None else np.asarray(rest_rad, np.float64)
-        self._ticks = conversion.to_ticks(self._goals.own.nearest(rest))  # goals; before any, the rest
-        self._warned = False  # that servos jump
+        self._ticks = conversion.to_ticks(self._goals.own.nearest(rest))  # last goals; before the first, the rest pose
+        self._warned = False  # the warning that servos jump has been logged
         self._counts["deferred"] = 0
         self._fault_log: dict[str, None] = {}
         self._forget()
 
     def _forget(self) -> None:
-        """Reset what holds for one connection only."""
+        """Reset the state of one connection."""
         self._outputs = [PulseOutput(index, servo) for index, servo in enumerate(self._servos)]
-        self._latched = False  # by `torque_off`: nothing is sent until `enable` or `resume`
-        self._off_due = False  # torque off is to be sent again by the next poll
-        self._pending = False  # goals that have not been sent yet
-        self._refresh_index = 0  # of the outputs that are on, the one that is sent though unchanged
+        self._latched = False  # set by `torque_off`: no goals are sent until `enable` or `resume`
+        self._off_due = False  # the next poll has to send torque off again
+        self._pending = False  # there are goals that have not been sent yet
+        self._refresh_index = 0  # index, among the outputs that are on, of the one that is sent even if unchanged
         self._sent_at_s = -math.inf
-        self._status_due_s: float | None = None  # when to ask the board next
+        self._status_due_s: float | None = None  # time of the next status request
         self._unanswered = 0
-        self._next_on_s = -math.inf  # when the next waiting output may come on
+        self._next_on_s = -math.inf  # time from which the next waiting output may come on
 
     def connect(self) -> None:
-        """Open the port and find the board, pulses left unchanged.
+        """Open the port and find the board; leave its pulses unchanged.
 
-        Raises PortError; BusError if the board does not answer, or is not set as the head's file says.
+        Raises PortError; BusError if the board does not answer, or if its settings contradict the head's file.
         """
         wire = self._open()
         self._forget()
@@ -151,8 +152,9 @@ class PulseBus(WireBus[RateLimitedPort]):
     def enable(self, joints: Sequence[str]) -> Doubles:
         """Switch on the pulses of `joints`, one after the other; return the angles sent, rad, in their order.
 
-        Blocks for 0.7 s a joint, and a few answers. Raises ConfigError unless the user has confirmed that joints may
-        jump; BusError if the board does not answer, or if `torque_off` came meanwhile: then no pulse is on.
+        Blocks for up to 0.7 s per joint, and for a few answers. Raises ConfigError unless the user has confirmed that
+        joints may jump; BusError if the board does not answer, or if `torque_off` is called meanwhile: then only pulses
+        of joints whose safety is hold are on.
         """
         wire = self._connected()
         self._unlatch()
@@ -175,7 +177,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         return self._outputs[self.joints.index(joint)]
 
     def _unlatch(self) -> None:
-        """Allow goals again; outputs stay off until each is switched on."""
+        """Allow goals again; outputs that torque off switched off stay off until each is switched on."""
         if self._latched:
             for output in self._outputs:
                 output.resting |= output.releases
@@ -188,11 +190,11 @@ class PulseBus(WireBus[RateLimitedPort]):
             raise BusError(f"bus {self.name!r}: torque was switched off while joints came on")
 
     def _switch_on(self, wire: RateLimitedPort, output: PulseOutput) -> float:
-        """Switch on the pulses of one joint; return the angle sent, rad. Raises BusError if `torque_off` comes."""
+        """Switch on the pulses of one joint; return the angle sent, rad. Raises BusError if `torque_off` is called."""
         new, index = not output.enabled, output.index
         self._powered |= {output.channel}
         output.resting = False
-        if output.pulse and new:  # the first goal is the pulse that the board sends already, inside the limits
+        if output.pulse and new:  # the first goal is the pulse that the board already sends, clipped to the limits
             ticks = self._ticks.copy()
             ticks[index] = output.pulse
             self._ticks = self._conversion.to_ticks(self._goals.own.nearest(self._conversion.to_rad(ticks)))
@@ -215,7 +217,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         return sorted(each.channel for each in self._outputs if each.resting or (self._latched and each.releases))
 
     def release(self, joints: Sequence[str]) -> None:
-        """End the pulses of `joints` now; the others continue. The next `poll` repeats it. From any thread."""
+        """End the pulses of `joints` now; the others continue. The next `poll` repeats it. Works in any thread."""
         for output in map(self._output, joints):
             output.resting, output.enabled, output.waiting, output.pulse, output.sent = True, False, False, 0, None
             self._off_due = True
@@ -223,14 +225,15 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._send_off(self._off)
 
     def torque_off(self, policy: StopPolicy) -> None:
-        """End the pulses now, except of joints whose safety says hold; send no goal until `enable` or `resume`.
+        """End the pulses now, except of joints whose safety is hold; send no goal until `enable` or `resume`.
 
-        From any thread or signal handler. Never raises, waits for no answer; blocks while bytes are handed to the port
-        and, if that was lost, while it is opened. A board that is away is switched off by `poll` when it is back.
+        May be called in any thread or signal handler. Never raises and waits for no answer. Blocks while bytes are
+        written to the port and, if the port was lost, while it is opened. `poll` switches off a lost board when it is
+        back.
         """
         if policy == "hold":
             return
-        self._latched = True  # first of all
+        self._latched = True  # before anything else
         for output in self._outputs:
             output.waiting, output.sent = False, None
             if output.releases:
@@ -242,13 +245,13 @@ class PulseBus(WireBus[RateLimitedPort]):
         off = self._off
         back = [output for output in map(self._output, joints) if output.channel in off and not output.waiting]
         for output in back:
-            output.waiting = output.enabled = True  # first: no goal is sent to them yet
+            output.waiting = output.enabled = True  # before `_unlatch`, so that no goal is sent to them yet
         self._unlatch()
         for output in back:
             output.resting = False
 
     def _send_off(self, channels: Sequence[int], restarted: bool = False) -> None:
-        """Send torque off over the open port, else over one opened for this: the bus's own may be in use."""
+        """Send torque off over the open port, else over a port opened only for this: the bus's own may be in use."""
         wire = self._link
         if not channels or (wire is None and not self._lost):
             return
@@ -264,9 +267,9 @@ class PulseBus(WireBus[RateLimitedPort]):
             self._off_due = True
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
-        """Send torque off, ask the board whether its pulses are off, and repeat it; refuse goals. Never raises.
+        """Send torque off, request the pulses from the board, and repeat it; refuse goals. Never raises.
 
-        Blocks for `within_s` at most; bytes sent before may take part of that to leave. From one thread at a time.
+        Blocks for `within_s` at most, including the time for earlier bytes to leave. Called in one thread at a time.
         """
         self.torque_off(policy)
         for output in self._outputs:
@@ -291,14 +294,14 @@ class PulseBus(WireBus[RateLimitedPort]):
     def _confirm_off(
         self, wire: RateLimitedPort, channels: Sequence[int], until_s: float, restarted: bool = False
     ) -> bool:
-        """Ask the board whether its pulses are off, and send torque off again; return whether it confirms it."""
-        for _ in range(4 * TRIES):  # each costs a mute board's patience
+        """Request the pulses from the board; while any is on, send torque off again. Return whether all are off."""
+        for _ in range(4 * TRIES):  # with a silent board each try blocks for the deadline of an answer
             wire.wait(min(wire.busy_until_s, until_s))
             if wire.port.now_s() >= until_s:
                 break
             pulses = self._board.read_pulses(wire, channels)
             on = {channel for channel, ticks in (pulses or {}).items() if ticks}
-            # A board that cannot report its pulses confirms by any answer; a lost answer of another one does not.
+            # For a board that cannot report pulses, any answer confirms. For another board a lost answer does not.
             if pulses is None and (self._board.reports_pulses or not answers(self._board, wire, 1, True)):
                 on = set(channels)
             self._powered &= on
@@ -310,7 +313,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     def end_pulses(self, channels: Sequence[int]) -> bool:
         """Open the port, end the pulses of `channels` and close it; return whether the board confirmed it.
 
-        For a bus that is not connected. Raises PortError, BusError.
+        The bus must not be connected. Raises PortError, BusError.
         """
         self._link = wire = self._open()
         try:
@@ -322,7 +325,7 @@ class PulseBus(WireBus[RateLimitedPort]):
     # --- every tick ---------------------------------------------------------------------------------------------
 
     def write(self, goals_rad: Doubles, now_s: float) -> None:
-        """Send goals of all joints; those of joints that are not enabled are left out.
+        """Send goals of all joints; goals of joints that are not enabled are left out.
 
         Raises ValueError, with nothing sent, before `enable` and after `stop`, for a goal that is not finite, or one
         out of range. While the port is gone, and after `torque_off`, nothing is sent and nothing is raised.
@@ -347,9 +350,9 @@ class PulseBus(WireBus[RateLimitedPort]):
         return readings
 
     def _ask(self, wire: RateLimitedPort, now_s: float) -> bool:
-        """Ask for the status once a second if the line is free; return whether there was an answer to that."""
+        """Request the status once a second, and send commands that are due; return whether a valid status arrived."""
         answered = False
-        if self._off_due:  # on a port that is gone unnoticed this raises, and the port is opened again
+        if self._off_due:  # raises if the port is gone unnoticed; the port is then opened again
             self._off_due = False
             if channels := self._off:
                 wire.send(self._board.encode_off(channels, self._silent))
@@ -385,7 +388,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         }
 
     def _flush(self) -> bool:
-        """Send the newest goals, unless the line is busy or the board is silent."""
+        """Send the newest goals; return False, with nothing sent, if the line is busy or the board is silent."""
         wire = self._link
         if wire is None or self._silent or not wire.free:
             return False
@@ -421,11 +424,11 @@ class PulseBus(WireBus[RateLimitedPort]):
         self._report_fault(self._outputs, _NO_ANSWER)
 
     def _returned(self, wire: RateLimitedPort, now_s: float) -> None:
-        self._status_due_s = now_s  # the board is asked before it gets any goal
+        self._status_due_s = now_s  # the board has to answer before it receives any goal
         self._send_off_again()
 
     def _send_off_again(self) -> None:
-        """Send torque off again after the board, or the port, was away: now if it is latched, else by a poll."""
+        """Send torque off again after the board, or the port, was lost: now if it is latched, else by a poll."""
         self._off_due |= any(output.resting for output in self._outputs)
         if self._latched:
             self._send_off(self._off)
@@ -435,7 +438,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         return self._unanswered >= _SILENT_AFTER
 
     def _take_status(self, wire: RateLimitedPort, answer: bytes, now_s: float) -> bool:
-        """Take an answer to the status request, empty if there was none; return whether it is valid."""
+        """Process the answer to a status request, empty if there was none; return whether it is valid."""
         status = self._board.decode_status(answer) if answer else None
         if status is None:
             self._counts["errors"] += 1
@@ -449,7 +452,7 @@ class PulseBus(WireBus[RateLimitedPort]):
             if output.fault != _TORQUE_LOST:
                 output.fault = None
             if was_silent or status.went_home:
-                output.sent = None  # what the board does now is not what was sent
+                output.sent = None  # the board may no longer send this pulse
         if was_silent:
             self._counts["reconnects"] += 1
             log.info("bus %r: the %s answers again", self.name, self.model)
@@ -467,7 +470,7 @@ class PulseBus(WireBus[RateLimitedPort]):
         return True
 
     def _report_fault(self, outputs: Sequence[PulseOutput], fault: str, shown: bool = True) -> None:
-        """Record a fault of some outputs; `shown` puts it into their readings, too."""
+        """Record a fault of some outputs; `shown` puts it into their readings too."""
         for output in outputs if shown else ():
             output.fault = fault
         named = f"{self.name}: {fault}"

@@ -2,8 +2,8 @@
 
 `Table` is plain data, so that an emulated servo in another process needs neither the loader nor its libraries.
 
-The *value* of a register is the number that the control loop uses; its *raw* form is what is sent. Four rules lead from
-one to the other: unsigned, two's complement, a sign bit above the magnitude, and an offset (2048 stands for zero).
+The *value* of a register is the number that the control loop uses; its *raw* form is sent. There are four rules to
+convert them: unsigned, two's complement, a sign bit above the magnitude, and an offset (2048 stands for zero).
 Registers of two and four bytes are sent in the byte order of the model: low byte first, but high byte first in the
 Feetech SCS.
 """
@@ -17,18 +17,18 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 if TYPE_CHECKING:
     from sfms_robot.config import FirmwareMap
 
-ASSUMED_SPEED_DEG_S = 300.0  # no-load speed if the maker states none: only an emulated motor needs one
+ASSUMED_SPEED_DEG_S = 300.0  # no-load speed if the manufacturer states none; only emulated motors need it
 ByteOrder = Literal["little", "big"]
 
-Values = Mapping[str, int]  # of registers, by name
+Values = Mapping[str, int]  # values of registers, by name
 
-_PER_TURN: Final = {"rpm": 60.0, "rev_per_min2": 3600.0}  # seconds, seconds squared; all other units are degrees
+_PER_TURN: Final = {"rpm": 60.0, "rev_per_min2": 3600.0}  # s, s^2; all other units are in degrees
 _ACCELERATIONS: Final = ("profile_acceleration", "goal_acceleration", "acceleration")
 _FROM_ROW: Final = {"address", "size", "access", "area", "unit", "scale", "low", "high", "signed"}
 
 
 class Field(NamedTuple):
-    """A register, as its row of the map. `low`..`high` are the values that may be written; `signed` is its rule."""
+    """A register, from its row of the map. `low`..`high`: values that may be written; `signed`: its sign rule."""
 
     name: str
     address: int
@@ -89,17 +89,17 @@ class Table:
         model_number: None if it is not known.
         fields: registers by name.
         ticks_per_revolution: position ticks of one turn.
-        top_speed_ticks_s: no-load speed; at `ASSUMED_SPEED_DEG_S` if the maker states none.
+        top_speed_ticks_s: no-load speed; from `ASSUMED_SPEED_DEG_S` if the manufacturer states none.
         baud_codes: code in role `baud_rate` -> bits per second; empty if the rate is not a register.
-        faults: bit of role `error_status` (of the error word, on a board) -> its meaning.
+        faults: bit of role `error_status` (on a board: of the error word) -> its meaning.
         family: dynamixel, feetech, maestro or ssc32.
         protocol: 1, 2, or None for a board.
         status_faults: bit of the error byte of a status packet -> fault of the servo (protocol 1, Feetech).
         roles: role -> register name, if they differ; None if the model has no such register.
-        watchdog: what the servo does when its host falls silent: stops, flags_only or none.
+        watchdog: reaction of the servo when its host falls silent: stops, flags_only or none.
         position_mode: value of role `operating_mode` for position control.
-        firmware: first and last firmware number that the table holds for.
-        channels, pulse_us, tick_us: of a board: outputs, (shortest, longest) pulse, pulse width of one tick.
+        firmware: first and last firmware number for which the table is valid.
+        channels, pulse_us, tick_us: for a board: number of outputs, (shortest, longest) pulse, pulse width of one tick.
     """
 
     model: str
@@ -157,7 +157,7 @@ class Table:
         return next((self.fields[name] for name in _ACCELERATIONS if name in self.fields), None)
 
     def in_ticks(self, field: Field, value: int = 1) -> float:
-        """Return the value of a register of speed or acceleration in ticks and seconds."""
+        """Return the value of a speed or acceleration register in units of ticks and seconds."""
         return field.to_unit(value) * self.ticks_per_revolution / _PER_TURN.get(field.unit, 360.0)
 
     @property
@@ -173,13 +173,13 @@ class Table:
 
     @property
     def servo_faults(self) -> Mapping[int, str]:
-        """Return bit -> fault: of every status packet (protocol 1), else of role `error_status` or the error word."""
+        """Return bit -> fault, for status packets (protocol 1), else for role `error_status` or the error word."""
         return self.status_faults if self.protocol == 1 else self.faults
 
     def faults_in(self, status: int) -> list[str]:
         """Return the faults in a value whose bits are those of `servo_faults`, in words.
 
-        Other bits of a status packet are about the request, and are left out.
+        Other bits of a status packet concern the request and are left out.
         """
         names, bits = self.servo_faults, [bit for bit in range(16) if status >> bit & 1]
         return [names.get(bit, f"hardware error bit {bit}") for bit in bits if bit in names or self.protocol != 1]

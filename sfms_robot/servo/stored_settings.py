@@ -1,4 +1,4 @@
-"""Compare what a servo stores with what the head's file says of its joint: values in, contradictions out, no I/O.
+"""Comparison of the stored settings of a servo with the head's file: values in, contradictions out, no I/O.
 
 Startup compares before torque comes on, `sfms-robot doctor` whenever it is run; both use these rules. Registers that a
 model does not have, or that were not read, are skipped.
@@ -19,7 +19,7 @@ from sfms_robot.servo.registers import Table, Values
 
 Then = Literal["refused", "set", "told"]
 
-REVERSE: Final = 0x01  # drive mode bit 0: ticks run the other way
+REVERSE: Final = 0x01  # drive mode bit 0: ticks count in the opposite direction
 _SLAVE: Final = 0x02  # drive mode bit 1: follows another motor over a separate cable (X540, MX-106)
 _TORQUE_AT_POWER_UP: Final = 0x01  # startup configuration bit 0
 _EXTENDED_MODE: Final = 4  # Protocol 2.0: extended position
@@ -27,8 +27,8 @@ _CURRENT_POSITION_MODE: Final = 5  # Protocol 2.0: position with bounded current
 _PROTECTIONS: Final = ("overheating", "overload", "electrical shock")
 _LIMITS: Final = (("min_position_limit", "max_position_limit"), ("cw_angle_limit", "ccw_angle_limit"))
 _OFFSETS: Final = ("homing_offset", "multi_turn_offset")
-_DIRECTION: Final = {"drive_mode": REVERSE | _SLAVE, "phase": 0x81}  # Feetech: of the motor (bit 0), of the encoder (7)
-_SCALES: Final = ("angular_resolution", "resolution_divider")  # other than 1: one of its ticks is several
+_DIRECTION: Final = {"drive_mode": REVERSE | _SLAVE, "phase": 0x81}  # Feetech: motor (bit 0), encoder (bit 7)
+_SCALES: Final = ("angular_resolution", "resolution_divider")  # above 1: one tick of the servo stands for several
 
 
 @dataclass(frozen=True)
@@ -36,10 +36,10 @@ class JointNeeds:
     """The requirements of a joint on the servo that moves it.
 
     Attributes:
-        low_ticks, high_ticks: first and last goal of the joint.
-        stored: EEPROM values that zero and direction in the head's file were measured with.
-        other_ids: the other servos of its bus.
-        bounded_current: its current is to be limited, if the servo can.
+        low_ticks, high_ticks: lowest and highest goal of the joint.
+        stored: EEPROM values with which zero and direction in the head's file were measured.
+        other_ids: ids of the other servos on its bus.
+        bounded_current: True to limit its current, if the servo supports it.
         allowed_faults: faults that the head's file ignores.
     """
 
@@ -58,9 +58,9 @@ class Contradiction:
 
     Attributes:
         wanted: the value that fits, as close to the stored one as possible.
-        then: `refused` at startup, `set` by startup, or `told`: a warning, since only the protection differs.
-        fixable: it can be corrected without harm; else a person has to look at it.
-        in_file: the head's file has to change, since zero and direction belong together with it; else the servo.
+        then: `refused` at startup, `set` by startup, or `told`: only a warning.
+        fixable: True if it can be corrected without harm; otherwise a person has to check it.
+        in_file: True if the head's file has to change, since zero and direction depend on the value; else the servo.
     """
 
     register: str
@@ -77,7 +77,7 @@ class Contradiction:
 
 
 def multi_turn(table: Table, needs: JointNeeds) -> bool:
-    """Return whether the goals of a joint leave the one turn of position mode, and the model can follow."""
+    """Return whether the goals of a joint exceed the single turn of position mode, and the model can reach them."""
     goal = table.role("goal_position")
     if goal is None or goal.low <= needs.low_ticks and goal.high < table.ticks_per_revolution:
         return False
@@ -85,9 +85,9 @@ def multi_turn(table: Table, needs: JointNeeds) -> bool:
 
 
 def operating_mode(table: Table, needs: JointNeeds) -> int | None:
-    """Return the value of role `operating_mode` for a joint; None if limits decide it (Protocol 1.0), or nothing does.
+    """Return the value of role `operating_mode` for a joint; None if limits set it (Protocol 1.0), or nothing does.
 
-    Many turns are mode 4 with Protocol 2.0; a Feetech STS stays in mode 0, and its limits decide.
+    Several turns need mode 4 with Protocol 2.0; a Feetech STS stays in mode 0, and its limits allow them.
     """
     if table.protocol == 2 and needs.bounded_current and "goal_current" in table.fields:
         return _CURRENT_POSITION_MODE
@@ -97,19 +97,19 @@ def operating_mode(table: Table, needs: JointNeeds) -> int | None:
 
 
 def limit_names(table: Table) -> tuple[str, str] | None:
-    """Return the names of the lower and the upper position limit; None for a model without."""
+    """Return the names of the lower and the upper position limit; None for a model without limits."""
     return next((names for names in _LIMITS if names[0] in table.fields), None)
 
 
 def limits_count(table: Table, needs: JointNeeds) -> bool:
-    """Return whether the servo compares goals with its position limits: not in modes 4 and 5, nor over many turns."""
+    """Return whether a servo compares goals with its position limits: not in modes 4 and 5, nor with several turns."""
     if table.protocol == 2:
         return operating_mode(table, needs) in (None, table.position_mode)
     return not multi_turn(table, needs)
 
 
 def contradictions(values: Values, table: Table, needs: JointNeeds) -> list[Contradiction]:
-    """Return every stored value of one servo that is not as its joint needs it, in the order of importance.
+    """Return every stored value of one servo that contradicts the needs of its joint, most important first.
 
     Args:
         values: registers by name, as read.
@@ -125,10 +125,10 @@ def contradictions(values: Values, table: Table, needs: JointNeeds) -> list[Cont
 
 
 def _mode_and_limits(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield another mode than that of the joint, then each limit inside the joint's range.
+    """Yield the operating mode if it is not the one that the joint needs, then each limit inside the joint's range.
 
-    Protocol 2.0 refuses goals beyond a limit, the others clip them silently. Many turns need both at 4095 (MX 1.0), or
-    both at 0 (STS).
+    Servos of Protocol 2.0 refuse goals beyond a limit, all others clip them silently. Several turns need both limits at
+    4095 (MX 1.0), or both at 0 (STS).
     """
     mode, wanted = table.role("operating_mode"), operating_mode(table, needs)
     if mode is not None and wanted is not None and (now := values.get(mode.name, wanted)) != wanted:
@@ -160,9 +160,9 @@ def _mode_and_limits(values: Values, table: Table, needs: JointNeeds) -> Iterato
 
 
 def _zero_and_direction(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield each offset, reverse bit and scale that would move the joint by a wrong angle or the wrong way.
+    """Yield each offset, reverse bit and scale that would move the joint by a wrong angle or in the wrong direction.
 
-    Then each other register that does not hold what the head's file declares.
+    Then yield each other register whose value differs from the head's file.
     """
     for name in _OFFSETS:
         now, wanted = values.get(name, 0), needs.stored.get(name, 0)
@@ -196,9 +196,9 @@ def offset_ticks(table: Table, stored: int) -> int:
 
 
 def _acts_unasked(values: Values, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield what makes a servo act without being sent a goal.
+    """Yield settings that make a servo act without a goal sent to it.
 
-    That is an active secondary id (0..252), whose writes it obeys too and never answers, and what it does at power-up.
+    These are an active secondary id (0..252), whose writes it also obeys but never answers, and actions at power-up.
     """
     now = values.get("secondary_id", 255)
     if now in needs.other_ids:
@@ -214,7 +214,7 @@ def _acts_unasked(values: Values, needs: JointNeeds) -> Iterator[Contradiction]:
 
 
 def _shutdown(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield faults that should take the torque away and do not, or that the head ignores and do."""
+    """Yield the shutdown register if a protective fault does not switch torque off, or an ignored fault does."""
     name = "unloading_condition" if table.family == "feetech" else "shutdown"
     if name not in values:
         return
@@ -233,7 +233,7 @@ def _shutdown(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contr
 
 
 def _turns(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradiction]:
-    """Yield a position beyond the one turn of position mode, or one that several turns of the joint have in common."""
+    """Yield a position beyond the single turn of position mode, or one that occurs in several turns of the joint."""
     present, turn = table.role("present_position"), table.ticks_per_revolution
     if present is None or present.name not in values:
         return
@@ -241,7 +241,7 @@ def _turns(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradi
     torque = table.role("torque_enable")
     if multi_turn(table, needs):
         if torque is not None and values.get(torque.name):
-            return  # it has had power since its position was known
+            return  # torque is on: the servo has had power since its position was known
         low, high = unique_ticks(turn, needs)
         if not low <= now <= high:
             low, high = home_ticks(turn, needs)
@@ -250,9 +250,9 @@ def _turns(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradi
                 f"off, turn it by hand to where it will read {low}..{high}, and switch it on"
             )
             yield Contradiction(present.name, now, (low + high) // 2, why, then="refused", fixable=False)
-    elif not min(0, offset) <= now < turn + max(0, offset):  # a homing offset shifts the one turn that there is
+    elif not min(0, offset) <= now < turn + max(0, offset):  # a homing offset shifts the single turn
         inside = (now - offset) % math.ceil(turn) + offset
-        clears = table.protocol == 2 and "homing_offset" in table.fields  # the instruction CLEAR; not the XL-320
+        clears = table.protocol == 2 and "homing_offset" in table.fields  # has instruction CLEAR; the XL-320 has not
         cure = ": turn it back by hand, or switch its supply off and on" * (not clears)
         yield Contradiction(
             present.name, now, inside, f"it was turned past one turn{cure}", then="refused", fixable=clears
@@ -260,15 +260,15 @@ def _turns(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contradi
 
 
 def unique_ticks(turn: float, needs: JointNeeds) -> tuple[int, int]:
-    """Return the first and last tick that belong to one position of the joint only; first > last if there are none.
+    """Return the first and last tick that belong to only one position of the joint; first > last if there are none.
 
-    A servo that may have lost its count of turns stands where it reports if that lies between them.
+    A servo that may have lost its count of turns still reports its true position if that lies between them.
     """
     whole = round(turn)
     return max(needs.low_ticks, needs.high_ticks - whole + 1), min(needs.high_ticks, needs.low_ticks + whole - 1)
 
 
 def home_ticks(turn: float, needs: JointNeeds) -> tuple[int, int]:
-    """Return `unique_ticks` within the turn at power-up."""
+    """Return the part of `unique_ticks` inside the turn that a servo reports at power-up."""
     low, high = unique_ticks(turn, needs)
     return max(low, 0), min(high, round(turn) - 1)

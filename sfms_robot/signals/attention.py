@@ -1,13 +1,14 @@
-"""Attention of a person to the head, from the direction of their eyes and head, relative to their neutral.
+"""Attention of a person to the robot's head, from the direction of the person's head and eyes relative to a neutral.
 
-Gaze is head plus eyes. A person who looks at the camera from the side turns to it, so where the place of their eyes is
-known the direction to the camera is subtracted first. The rest has a neutral: a phone that stands aside, a tracker's
-offset, a camera beside the head. It is learnt as a running median (every look moves it by the same small step, however
-far it goes), quickly in the first seconds of a face and slowly after, so that looks aside for less than half of the
-time do not become the neutral.
+Gaze is head plus eyes. A person looking at the camera from the side turns to it, so the direction to the camera is
+subtracted first if the place of the eyes is known. The remaining gaze has a neutral that is not 0, because of a phone
+that stands aside, a tracker's offset, or a camera next to the head. It is learned as a running median (every frame
+moves it by the same small step, for any distance), quickly in the first seconds of a face and slowly after, so that
+looks aside for less than half of the time do not become the neutral.
 
-Laws: a blink changes nothing; 30 degrees aside is under 0.2 within 0.3 s; never more attention for a larger angle; no
-number without a face, nor from a face that has shown neither a head nor eyes that turn (a tracker of the mouth alone).
+Laws: a blink changes nothing; attention is under 0.2 within 0.3 s of a look 30 degrees aside; a larger angle never has
+more attention; there is no value without a face, or from a face whose head and eyes have not turned (a tracker of the
+mouth alone).
 """
 
 from __future__ import annotations
@@ -21,15 +22,15 @@ import numpy as np
 from sfms_robot.frames import BLINKS, YAW_PITCH, Doubles, FaceFrame, Floats
 from sfms_robot.signals.gaze_kinematics import EYES_RAD, direction_to, directions
 
-HALF_RAD: Final = math.radians(10.0)  # attention 0.5: about twice what a gaze from a face tracker scatters
+HALF_RAD: Final = math.radians(10.0)  # angle of attention 0.5: about twice the scatter of gaze from a face tracker
 SLOPE_RAD: Final = math.radians(2.0)
 SMOOTH_S: Final = 0.1
-CLOSED: Final = 0.5  # of eyeBlink; the eye channels of a closed eye mean nothing
-BLINK_S: Final = 0.5  # closed for longer, eyes look at nothing
+CLOSED: Final = 0.5  # value of eyeBlink; the eye channels of a closed eye are meaningless
+BLINK_S: Final = 0.5  # eyes that are closed for longer look at nothing
 NEUTRAL_START_RAD_S: Final = math.radians(6.0)
 NEUTRAL_RAD_S: Final = math.radians(0.3)
 SETTLE_S: Final = 4.0
-FORGET_S: Final = 10.0  # a face after so long is another person
+FORGET_S: Final = 10.0  # a face that appears after this time counts as another person
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,12 +38,12 @@ class AttentionState:
     """Memory of a face.
 
     Attributes:
-        time_s: of the last face; None before the first.
+        time_s: time of the last face; None before the first.
         seen_s: total time with open eyes.
         neutral_rad: (2,) yaw and pitch of a gaze at the head.
-        eyes_rad: (2,) of the last open eyes, at `open_s`.
-        attention: of the last face.
-        turns: head or eyes have been anywhere but at zero.
+        eyes_rad: (2,) direction of the last open eyes, at `open_s`.
+        attention: attention of the last face.
+        turns: True once head or eyes have not been at zero.
     """
 
     time_s: float | None = None

@@ -1,4 +1,4 @@
-"""Sound files and pieces of sound: any format, rate and channel count in; mono float32 at 16 kHz out."""
+"""Conversion of sound files and pieces of sound, of any format, rate and channel count, to mono float32 at 16 kHz."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ logger = logging.getLogger(__name__)
 
 LOWEST_RATE_HZ: Final = 4_000  # a telephone has 8000
 HIGHEST_RATE_HZ: Final = 384_000
-LOUDEST: Final = 8.0  # full scale is 1; a file that goes beyond this was written in another unit
-_BLOCK: Final = 65_536  # samples of a file at once
-_UNBOUNDED: Final = ("FLOAT", "DOUBLE")  # sample formats that hold more than full scale, and NaN
-_NO_SIZE: Final = 0x7FFF0000  # of a WAV file: programs that write to a pipe put 0, or this or more
-_HEAD: Final = 65_536  # bytes in which the samples of a WAV file begin
-_LOST: Final = 0.3  # of the loudest channel's energy: less left in the mean is a voice that is lost
-_OPPOSITE: Final = -0.5  # correlation with the loudest channel
-_STUDIED: Final = 48_000  # samples louder than this, in which a mix is decided
+LOUDEST: Final = 8.0  # full scale is 1; a file with larger samples was written in another unit
+_BLOCK: Final = 65_536  # samples read from a file at once
+_UNBOUNDED: Final = ("FLOAT", "DOUBLE")  # sample formats that may hold more than full scale, and NaN
+_NO_SIZE: Final = 0x7FFF0000  # size in a WAV file: programs that write to a pipe write 0, or this or more
+_HEAD: Final = 65_536  # bytes within which the samples of a WAV file begin
+_LOST: Final = 0.3  # share of the loudest channel's energy below which the mean has lost a voice
+_OPPOSITE: Final = -0.5  # correlation with the loudest channel below which a channel has the opposite sign
+_STUDIED: Final = 48_000  # audible samples (louder than `_AUDIBLE`) after which a mix is decided
 _AUDIBLE: Final = 1e-3
 
 
 class Downmix:
     """Mix of several channels to one: their mean, unless it loses a voice.
 
-    In a mean, a voice in one of six channels loses 15.6 dB, and one with opposite signs in two is silence. Where the
-    mean is 5 dB or more below the loudest channel, channels are added at that one's level, those of opposite sign
-    turned around. That is decided in the first second of sound, and said. `name`: of the sound, in the log.
+    In a mean, a voice in one of six channels loses 15.6 dB, and a voice with opposite signs in two channels is silent.
+    If the mean is 5 dB or more below the loudest channel, channels are added at the level of the loudest one, those of
+    opposite sign inverted. That is decided in the first 48,000 audible samples, and logged with `name` as the sound.
 
     Attributes:
-        decided: enough sound was heard.
-        line: what is logged of a mix that is not the mean; empty before, and for the mean.
+        decided: True once enough sound was received.
+        line: the log line about a mix that is not the mean; empty before the decision, and for the mean.
     """
 
     def __init__(self, name: str = "sound") -> None:
@@ -59,7 +59,7 @@ class Downmix:
         self.line = ""
 
     def __call__(self, samples: Floats) -> Floats:
-        """Return (n,) of finite samples (n,) or (n, channels)."""
+        """Mix finite samples (n,) or (n, channels) to (n,)."""
         if samples.ndim == 1:
             return samples
         if not self.decided or len(self._moments) != samples.shape[1]:
@@ -68,7 +68,7 @@ class Downmix:
         return mixed.astype(np.float32)
 
     def study(self, samples: Floats) -> None:
-        """Decide by these samples (n, channels) too."""
+        """Update the mix by samples (n, channels)."""
         channels = samples.shape[1]
         if len(self._moments) != channels:
             self._moments, self._heard, self.decided = np.zeros((channels, channels)), 0, False
@@ -86,7 +86,7 @@ class Downmix:
             self.decide()
 
     def decide(self) -> None:
-        """Keep the mix from now on, and say one that is not the mean."""
+        """Keep the mix unchanged from now on, and log it if it is not the mean."""
         self.decided = True
         if self._weights is not None:
             turned = ", those of opposite sign turned around" if (self._weights < 0).any() else ""
@@ -96,9 +96,9 @@ class Downmix:
 
 
 class Resampler:
-    """A stream from one rate to 16 kHz; its pieces, put together, equal the whole resampled at once.
+    """A streaming resampler to 16 kHz; its pieces, joined, equal the whole signal resampled at once.
 
-    mix: of several channels to one; None: one that decides by this stream.
+    mix: mix of several channels to one; None: a new mix, which is decided by this stream.
     """
 
     def __init__(self, rate_hz: float, mix: Downmix | None = None) -> None:
@@ -110,7 +110,7 @@ class Resampler:
             self._stream = soxr.ResampleStream(rate_hz, AUDIO_HZ, 1, dtype="float32", quality="HQ")
 
     def push(self, samples: Floats, last: bool = False) -> Floats:
-        """Return (m,) mono, -1..1, of samples (n,) or (n, channels); some come out later, the rest with `last`."""
+        """Resample (n,) or (n, channels) to (m,) mono, -1..1; some samples come out later, the rest with `last`."""
         mixed = self._mix(samples)
         if self._stream is not None:
             mixed = self._stream.resample_chunk(np.ascontiguousarray(mixed), last=last)
@@ -120,11 +120,11 @@ class Resampler:
 class AudioFile:
     """A sound file as mono 16 kHz, -1..1, read in pieces: channels mixed (`Downmix`), other rates resampled.
 
-    Raises ConfigError, in one line, for a file that is missing, no sound, empty, of a rate outside 4 to 384 kHz, not
-    finite or far beyond full scale. One that is cut off is used as far as it goes, and the log says so.
+    Raises ConfigError, in one line, for a file that is missing, not sound, empty, of a rate outside 4 to 384 kHz, not
+    finite or far beyond full scale. A file that is cut off is used up to its end, with a warning in the log.
 
     Attributes:
-        length: samples at 16 kHz.
+        length: number of samples at 16 kHz.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -173,7 +173,7 @@ class AudioFile:
 
         try:
             samples = self._file.read(_BLOCK, dtype="float32", always_2d=True)
-        except soundfile.LibsndfileError as error:  # what is compressed tells only now
+        except soundfile.LibsndfileError as error:  # compressed data fails only when it is read
             logger.warning("%s: cannot be read to its end: %s", self.path, error)
             samples = np.zeros((0, self._file.channels), dtype=np.float32)
         self._over = len(samples) < _BLOCK
@@ -198,7 +198,7 @@ def _opened(path: Path) -> soundfile.SoundFile:
     try:
         with path.open("rb") as raw:
             head = raw.read(_HEAD)
-        place = os.fsencode(path) if os.name == "posix" else str(path)  # the library would not encode every path
+        place = os.fsencode(path) if os.name == "posix" else str(path)  # the library cannot encode every path
         return soundfile.SoundFile(_whole_wav(path, head) or place)
     except (soundfile.SoundFileError, OSError, TypeError, ValueError) as error:
         if kind := archive_kind(head):
@@ -208,7 +208,7 @@ def _opened(path: Path) -> soundfile.SoundFile:
 
 
 def _whole_wav(path: Path, head: bytes) -> io.BytesIO | None:
-    """Return a WAV file with its true sizes, where it was written to a pipe, which does not know them; else None."""
+    """Return a WAV file with its true sizes if it was written to a pipe, where they are unknown; else None."""
     place = 12
     while head[:4] == b"RIFF" and place + 8 <= len(head):
         name, size = struct.unpack_from("<4sI", head, place)
@@ -233,7 +233,7 @@ def _check(file: soundfile.SoundFile, path: Path) -> None:
     if not LOWEST_RATE_HZ <= file.samplerate <= HIGHEST_RATE_HZ:
         allowed = f"{LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ}"
         raise ConfigError(f"{path}: {file.samplerate} samples a second is not a rate of speech ({allowed})")
-    if "(should be" in file.extra_info:  # libsndfile's log: a chunk is longer than what is there
+    if "(should be" in file.extra_info:  # in libsndfile's log: a chunk is longer than its data
         logger.warning("%s: is cut off, its header promises more than the %d samples there are", path, file.frames)
     for _ in range(math.ceil(file.frames / _BLOCK)) if file.subtype in _UNBOUNDED else ():
         block = file.read(_BLOCK, dtype="float32", always_2d=True)
@@ -243,7 +243,7 @@ def _check(file: soundfile.SoundFile, path: Path) -> None:
 
 
 def check_scale(name: str, samples: NDArray[Any]) -> None:
-    """Raise InputError for samples far beyond full scale: in another unit. Those that are not finite are left out."""
+    """Raise InputError for samples far beyond full scale: in another unit. Samples that are not finite are ignored."""
     peak = float(np.abs(samples).max(initial=0.0, where=np.isfinite(samples)))
     if peak > LOUDEST:
         raise InputError(f"{name}: holds samples up to {peak:g}, full scale is 1: divide them (16-bit: by 32768)")
@@ -262,7 +262,7 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 def finite(samples: Floats) -> tuple[Floats, int]:
-    """Return the samples, 0 for those that are not finite, and how many these are."""
+    """Return the samples, with 0 for those that are not finite, and the number of those."""
     good = np.isfinite(samples)
     bad = samples.size - int(np.count_nonzero(good))
     return np.where(good, samples, np.float32(0)) if bad else samples, bad
@@ -283,17 +283,17 @@ def _db(energy: float, samples: int) -> float:
     return 10 * math.log10(max(energy / max(samples, 1), 1e-10))
 
 
-# --- A sampled signal between its samples, by a windowed sinc: for odd rates, and rates that change -------------------
+# --- Interpolation between samples by a windowed sinc, for odd rates and rates that change ----------------------------
 
 _TAPS: Final = 32
-_PHASES: Final = 4096  # of one sample: the nearest is taken, which is 70 dB exact
+_PHASES: Final = 4096  # positions within one sample; the nearest is used, with an error of -70 dB
 _BETA: Final = 8.0  # of the Kaiser window
 _AROUND: Final = np.arange(1 - _TAPS // 2, 1 + _TAPS // 2)
 
 
 @lru_cache(maxsize=1)
 def _kernels() -> Floats:
-    """Return (phases + 1, taps): weights of the samples around an instant, by its distance behind the one before."""
+    """Return weights (phases + 1, taps) of the samples around an instant, by its distance after the sample before."""
     behind = np.arange(_PHASES + 1)[:, None] / _PHASES - _AROUND
     inside = np.clip(1.0 - (2.0 * behind / _TAPS) ** 2, 0.0, 1.0)
     kernels = np.sinc(behind) * np.i0(_BETA * np.sqrt(inside)) / np.i0(_BETA)
@@ -301,9 +301,9 @@ def _kernels() -> Floats:
 
 
 def at_positions(samples: Floats, positions: Doubles) -> Floats:
-    """Return the signal (n,), n > 0, at `positions` (m,) in samples, whole or not; outside its samples it is 0.
+    """Return values (m,) of a signal (n,), n > 0, at `positions` (m,) in samples, whole or not; 0 outside of it.
 
-    Exact at whole positions; elsewhere within -60 dB up to 0.8 of half its rate.
+    Exact at whole positions; elsewhere the error is below -60 dB up to 0.8 of half the signal's rate.
     """
     before = np.floor(positions)
     phases = np.rint((positions - before) * _PHASES).astype(np.intp)

@@ -1,11 +1,11 @@
 """Control rows: decided events, such as a nod, a smile or a blink, as numbers per frame for a model of motion.
 
-Training uses the events that a dyad is made of, a stream those decided so far; both get the same rows from here. Row i
-is the face at the end of frame i. Laws: rows of two halves are the rows of the whole; an event outside its time changes
-nothing; rows are finite, and bounded by `BOUND`, for any events.
+Training uses the events from which a dyad is made, a stream those decided so far; both get the same rows from here. Row
+i describes the end of frame i. Laws: the rows of two halves equal the rows of the whole; an event outside its time
+changes nothing; rows are finite, and bounded by `BOUND`, for any events.
 
-Of every kind: it is under way (0 or 1), for how long (logarithm), how much of it is over (0..1), its size. Of kinds
-that swing also sine and cosine of the swing: where in it the head is.
+Columns of each kind: active (0 or 1), time since its start (logarithm), share of it that is over (0..1), size. Kinds
+that swing also have sine and cosine of the phase of the swing.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ import numpy as np
 
 from sfms_robot.frames import FRAME_S, Doubles, Floats, ListenerEvent
 
-# A gaze shift is not among them: the eyes follow `gaze_kinematics`, behind the model.
+# Gaze shifts are missing, because the eyes follow `gaze_kinematics` after the model.
 KINDS: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "blink")
 SWINGING: Final = ("nod", "shake")
-FULL_SIZE: Final = {"nod": np.deg2rad(6.0), "shake": np.deg2rad(8.0), "tilt": np.deg2rad(5.0)}  # told as 1; else 1 is 1
+FULL_SIZE: Final = {"nod": np.deg2rad(6.0), "shake": np.deg2rad(8.0), "tilt": np.deg2rad(5.0)}  # coded as 1; default 1
 BOUND: Final = 4.0
 _EACH: Final = 4
 COLUMNS: Final = tuple(f"{kind}.{what}" for kind in KINDS for what in ("active", "since", "over", "size")) + tuple(
@@ -49,7 +49,7 @@ def control_track(events: Sequence[ListenerEvent], first: int, frames: int) -> F
         out[rows, at + 2] = over
         out[rows, at + 3] = min(abs(event.size) / FULL_SIZE.get(event.kind, 1.0), BOUND)
         if event.kind in SWINGING:
-            # Behind the columns of all kinds: where in its swing the head is.
+            # After the columns of all kinds: the phase of the swing.
             at = _EACH * len(KINDS) + 2 * SWINGING.index(event.kind)
             turn = 2 * np.pi * event.swings * over
             out[rows, at], out[rows, at + 1] = np.sin(turn), np.cos(turn)

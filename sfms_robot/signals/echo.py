@@ -1,9 +1,9 @@
-"""Echo cancellation: a microphone signal without the robot's own loudspeaker.
+"""Echo cancellation: removal of the robot's own loudspeaker from a microphone signal.
 
 An adaptive filter removes the linear echo, WebRTC's AEC3 (`pywebrtc-audio`) the rest. AEC3 alone mutes a person who
-talks over an equally loud loudspeaker; behind the filter it has little to mute. After half a second without own voice
-its output is not used at all: its high-pass costs speech detection a lot in low noise of motors. Speech over the
-loudspeaker is detected in the output of the filter, which mutes no voice.
+talks over an equally loud loudspeaker; after the filter it has little to mute. After half a second without own voice
+its output is not used at all, because its high-pass filter harms speech detection a lot in low motor noise. Speech over
+the loudspeaker is detected in the output of the adaptive filter, which does not mute voices.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from sfms_robot.frames import AUDIO_HZ, Doubles, Floats
 
-ECHO_LATENCY_SAMPLES: Final = 128  # of AEC3's filter bank: 8 ms
-_TAIL_BLOCKS: Final = 50  # of 10 ms after the reference's end: echoes and AEC3's longest delay
+ECHO_LATENCY_SAMPLES: Final = 128  # latency of AEC3's filter bank, 8 ms
+_TAIL_BLOCKS: Final = 50  # blocks of 10 ms after the reference's end, for echoes and AEC3's longest delay
 _SILENCE: Final = 1e-3  # of full scale
 BLOCK: Final = 160  # samples, 10 ms
 PARTITIONS: Final = 25  # of 10 ms: echoes up to 250 ms after the reference
-_FORGETTING: Final = 0.9995  # per block: how far the room may change
-_NOISE_MEMORY: Final = 0.7  # per block, of the power that no echo explains
+_FORGETTING: Final = 0.9995  # per block; allows for changes of the room
+_NOISE_MEMORY: Final = 0.7  # per block, for the power that the echo does not explain
 _LEAST_POWER: Final = 1e-10
-_OVERRATED: Final = 0.3  # its uncertainty says 10 to 20 dB more echo than measured; more than that still disturbs
+_OVERRATED: Final = 0.3  # share of the expected echo, which is 10 to 20 dB above the measured; more still disturbs
 
 Spectrum = NDArray[np.complex128]
 
@@ -34,10 +34,10 @@ class EchoFilter:
     A partitioned-block Kalman filter in the frequency domain (Enzner and Vary 2006, Kuech et al. 2014).
 
     Its step size follows from its own uncertainty and the power that the echo does not explain: when a person talks
-    over the loudspeaker it adapts slowly, so that double talk needs no detector. Memory is fixed; no latency.
+    over the loudspeaker it adapts slowly, so that no detector of double talk is needed. Memory is fixed; no latency.
 
     Attributes:
-        residual_power: (161,) of the echo that it expects in its last block.
+        residual_power: (161,) power of the echo expected in the output of the last block.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class EchoFilter:
         self.residual_power: Doubles = np.zeros(BLOCK + 1)
 
     def push(self, mic: Doubles, reference: Doubles) -> Doubles:
-        """Return one block (160,) of the microphone without the echo that the filter knows of the reference (160,)."""
+        """Return one block (160,) of the microphone without the echo of the reference (160,) as estimated so far."""
         self._reference = np.concatenate([self._reference[BLOCK:], reference])
         self._spectra = np.roll(self._spectra, 1, axis=0)
         self._spectra[0] = np.fft.rfft(self._reference)
@@ -81,7 +81,7 @@ class Cancelled(NamedTuple):
     Attributes:
         audio: (b * 160,) without echo, `ECHO_LATENCY_SAMPLES` late.
         linear: (b * 160,) output of the filter alone, not late.
-        residual_power: (b, 161) of the echo in each block of `linear`, as the filter expects it (`EchoFilter`).
+        residual_power: (b, 161) power of the echo expected in each block of `linear` (`EchoFilter`).
     """
 
     audio: Floats
@@ -90,10 +90,10 @@ class Cancelled(NamedTuple):
 
 
 class EchoCanceller:
-    """Echo canceller for any number of blocks of 10 ms, on which its output does not depend.
+    """Echo canceller for blocks of 10 ms; the output does not depend on the number of blocks per call.
 
     Causal; the output is `ECHO_LATENCY_SAMPLES` late. Memory is fixed. AEC3 finds a loudspeaker's delay up to half a
-    second; the filter covers the first 250 ms. Without a reference the microphone passes unchanged but for the delay.
+    second; the filter covers the first 250 ms. Without a reference the microphone is only delayed.
     """
 
     def __init__(self) -> None:
@@ -103,7 +103,7 @@ class EchoCanceller:
         self._suppressor = Aec3(AUDIO_HZ)
         self._past: Floats = np.zeros(ECHO_LATENCY_SAMPLES, np.float32)
         self._silent_blocks = _TAIL_BLOCKS
-        self._share = 0.0  # of AEC3 in the output
+        self._share = 0.0  # share of AEC3 in the output
 
     def push(self, mic: Floats, reference: Floats) -> Cancelled:
         """Return (b * 160,) samples, b > 0, of a microphone without the echo of the reference at the same instants.

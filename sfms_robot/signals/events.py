@@ -1,4 +1,4 @@
-"""Nods, blinks and smiles in a motion.
+"""Detection of nods, blinks and smiles in a motion.
 
 Pure functions on arrays sampled at `rate_hz` (25 in this project). An event is (start_s, end_s, size).
 """
@@ -52,7 +52,7 @@ def find_nods(pitch_rad: ArrayLike, rate_hz: float) -> list[Event]:
 def find_blinks(blink: ArrayLike, rate_hz: float) -> list[Event]:
     """Find blinks in a lid closure (N,) 0..1: rises by 0.35 that are over within 0.6 s. One frame is enough.
 
-    Returns (start_s, end_s, height), counted against the closure around it, so lids that rest half closed are fine.
+    Returns (start_s, end_s, height), measured from the closure around it, so that resting lids may be half closed.
     """
     framed = np.r_[0.0, np.asarray(blink, np.float64), 0.0]
     peaks, heights = find_peaks(framed, _BLINK, max(1, int(0.12 * rate_hz)))
@@ -81,7 +81,7 @@ class EventKind:
     Attributes:
         signal: motion (..., 58) -> the signal (...,) that shows the event.
         find: signal (N,) and its rate -> events in order.
-        whole: the event is reported only when it is over.
+        whole: True if the event is reported only when it is over.
     """
 
     signal: Callable[[Reals], Reals]
@@ -107,18 +107,18 @@ def runs(mask: ArrayLike) -> list[tuple[int, int]]:
 
 # --- Peaks and a zero-phase band-pass: numpy versions of scipy.signal -------------------------------------------------
 #
-# scipy takes 1.5 s and 60 MB to load, in a process that drives servos a hundred times a second. These functions give
+# scipy needs 1.5 s and 60 MB to load, in a process that drives servos a hundred times a second. These functions return
 # the same numbers (tests compare them).
 
 
-_SETTLED: Final = 1e-12  # of what is left of a step when the filter counts as settled
+_SETTLED: Final = 1e-12  # remaining share of a step at which the filter counts as settled
 _EDGE: Final = 15  # samples mirrored at both ends, as scipy.signal.sosfiltfilt does for this order
 
 
 def find_peaks(values: Doubles, prominence: float, distance: int = 1) -> tuple[Indices, Doubles]:
-    """Find local maxima of (N,) that stand out by `prominence`, at least `distance` samples apart, and by how much.
+    """Find local maxima of (N,) with `prominence` or more, at least `distance` samples apart, and their prominences.
 
-    The middle of a plateau is its peak. Of two that are too close the higher one stays, of equal ones the later.
+    The middle of a plateau is its peak. Of two that are too close the higher one is kept, of equal ones the later.
     """
     peaks = _maxima(values)
     apart = np.ones(len(peaks), dtype=np.bool_)
@@ -147,10 +147,10 @@ def half_widths(values: Doubles, peaks: Indices, prominences: Doubles) -> tuple[
 
 
 def band_pass(values: Doubles, low_hz: float, high_hz: float, rate_hz: float) -> Doubles:
-    """Filter (N,), N > 15, by a Butterworth band-pass of second order forwards and backwards, so that nothing is late.
+    """Filter (N,), N > 15, by a Butterworth band-pass of second order forwards and backwards, so without delay.
 
-    As in scipy.signal.sosfiltfilt, both ends are mirrored through their last value, and before and after that the
-    signal counts as constant, of which a band-pass lets nothing through. So both passes begin at rest.
+    As in scipy.signal.sosfiltfilt, both ends are mirrored through their last value. Before and after that the signal
+    counts as constant, which a band-pass does not let through. So both passes begin at rest.
     """
     start, end = 2 * values[0] - values[_EDGE:0:-1], 2 * values[-1] - values[-2 : -_EDGE - 2 : -1]
     mirrored = np.concatenate([start, values, end])
@@ -170,7 +170,7 @@ def band_pass(values: Doubles, low_hz: float, high_hz: float, rate_hz: float) ->
 
 
 def _maxima(values: Doubles) -> Indices:
-    """Return samples higher than both neighbours; the middle of a plateau, the lower of two middles."""
+    """Return the indices of samples higher than both neighbours; of a plateau the middle, the lower of two middles."""
     if len(values) < 3:
         return np.zeros(0, dtype=np.intp)
     starts = np.flatnonzero(np.r_[True, np.diff(values) != 0])  # of stretches of equal values
@@ -185,7 +185,7 @@ def _maxima(values: Doubles) -> Indices:
 def _prominences(values: Doubles, peaks: Indices) -> Doubles:
     """Return the depth that separates each peak from the next higher one, on the side where it is smaller.
 
-    Only turning points are walked: a tick of the loop may wait for it.
+    Only turning points are visited, because a tick of the loop may wait for this function.
     """
     turns = np.unique(np.r_[0, _maxima(values), _maxima(-values), len(values) - 1])
     levels = values[turns].tolist()
@@ -196,9 +196,9 @@ def _prominences(values: Doubles, peaks: Indices) -> Doubles:
 
 
 def _lowest_since_higher(levels: Sequence[float]) -> list[float]:
-    """Return for each level the lowest one since a higher one came, its own included."""
+    """Return for each level the lowest level since the last higher one, itself included."""
     lowest: list[float] = []
-    falling: list[tuple[float, float]] = []  # levels that are still in sight, each with its lowest
+    falling: list[tuple[float, float]] = []  # levels that no later one has reached, each with its lowest level
     for level in levels:
         low = level
         while falling and falling[-1][0] <= level:

@@ -1,7 +1,7 @@
-"""Tables of faces in files: CSV (also gzipped) and JSON as a header and rows, OpenFace's columns as ours, row times.
+"""Tables of faces in files: header and rows of CSV (also gzipped) and JSON, OpenFace's columns as ours, row times.
 
-JSON is a list of frames, one after the other or in the first list of an object: `{"time_s": 0.04, "jawOpen": 0.2}`, or
-with the categories that MediaPipe returns, at any depth: `{"categoryName": "jawOpen", "score": 0.2}`. Its
+JSON is a list of frames, or an object whose first list holds the frames. A frame is `{"time_s": 0.04, "jawOpen": 0.2}`,
+or has the categories that MediaPipe returns, at any depth: `{"categoryName": "jawOpen", "score": 0.2}`. MediaPipe's
 transformation matrix becomes the head pose.
 """
 
@@ -33,29 +33,29 @@ Table = tuple[list[str], list[list[str]]]
 _TIME_NAME: Final = re.compile(r"timecode|(?:t|time|timestamp)(?:_(s|ms|us|ns))?", re.IGNORECASE)
 _TIME_UNITS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _COUNT_NAME: Final = re.compile(r"frames?(_?(id|index|number|count))?", re.IGNORECASE)
-_USUAL_STEP_S: Final = (1e-3, 2.0)  # beyond these a time column is in another unit
-_MOST_DOUBLED: Final = 0.1  # share of rows; more are times that are too coarse
+_USUAL_STEP_S: Final = (1e-3, 2.0)  # time between rows; outside this range a time column has another unit
+_MOST_DOUBLED: Final = 0.1  # share of rows with a repeated time; if there are more, the times are too coarse
 _COUNTS: Final = (24, 25, 30, 48, 50, 60, 100, 120)  # frames that a timecode counts in a second
-_USUAL_COUNT: Final = 60  # of the Live Link app, whatever the rate of its rows
+_USUAL_COUNT: Final = 60  # counts a second of the Live Link app, for any rate of its rows
 _LABELS: Final = ("categoryName", "category_name")
 _MATRIX: Final = re.compile(r"(facial)?_?transform(ation)?_?matri(x|ces|xes)", re.IGNORECASE)  # of MediaPipe
-_LANDMARKS: Final = re.compile(r"landmark", re.IGNORECASE)  # points x, y, z of the picture: not places of the head
+_LANDMARKS: Final = re.compile(r"landmark", re.IGNORECASE)  # points x, y, z in the picture, not places of the head
 _LAST_ROW: Final = (0.0, 0.0, 0.0, 1.0)
-_SCALED: Final = 0.1  # of a determinant from 1: not a rotation
+_SCALED: Final = 0.1  # difference of a determinant from 1, above which a matrix is not a rotation
 _DIVIDERS: Final = (",", ";", "\t")
-_OPENFACE_FULL: Final = 5.0  # intensity of an action unit
+_OPENFACE_FULL: Final = 5.0  # full intensity of an action unit
 _LOST: Final = ("success", "confidence")
 
 
 def is_counted(name: str) -> bool:
-    """Return whether a column holds times or counts, which a face does without."""
+    """Return whether a column holds times or counts, which are not part of a face."""
     return bool(_TIME_NAME.fullmatch(name) or _COUNT_NAME.fullmatch(name))
 
 
 def csv_cells(file: Path) -> Table:
-    """Return the header and the rows that are not empty, of a CSV or JSON file that may be gzipped.
+    """Read the header and the rows that are not empty from a CSV or JSON file, which may be gzipped.
 
-    Cells are divided by commas, or by semicolons or tabs, and then decimals may have a comma. Raises ConfigError.
+    Cells are divided by commas, or by semicolons or tabs, with which decimals may have a comma. Raises ConfigError.
     """
     try:
         data = file.read_bytes()
@@ -68,7 +68,7 @@ def csv_cells(file: Path) -> Table:
             return _json_table(file, text)
         mark = max(_DIVIDERS, key=text.lstrip().partition("\n")[0].count)
         rows = [[cell.strip() for cell in row] for row in csv.reader(io.StringIO(text), delimiter=mark) if row]
-        if mark != ",":  # of a country in which 0,5 is a half
+        if mark != ",":  # decimals may have a comma, as in 0,5
             rows = [[cell.replace(",", ".") for cell in row] for row in rows]
     except FileNotFoundError:
         raise ConfigError(f"{file}: no such file") from None
@@ -80,7 +80,7 @@ def csv_cells(file: Path) -> Table:
 
 
 def csv_numbers(file: Path, column: str, cells: Iterable[str]) -> Doubles:
-    """Return the numbers of a column, one row after the other from row 2 on. Raises ConfigError for another cell."""
+    """Return the numbers of a column, whose first cell is in row 2. Raises ConfigError for any other cell."""
     numbers = []
     for row, cell in enumerate(cells, 2):
         try:
@@ -94,7 +94,7 @@ def csv_numbers(file: Path, column: str, cells: Iterable[str]) -> Doubles:
 
 
 def _json_table(file: Path, text: str) -> Table:
-    """Return frames of numbers by name as a table; a frame without a face channel is one without a face."""
+    """Convert JSON frames of numbers by name to a table; a frame without a face channel has no face."""
     try:
         frames = json.loads(text)
         if isinstance(frames, dict):
@@ -136,7 +136,7 @@ def _named(value: Any, name: str = "") -> Iterator[tuple[str, float]]:
 def _pose(name: str, value: Any) -> Iterator[tuple[str, float]]:
     """Yield the head pose of a transformation matrix face -> camera [cm], by rows or by columns, of the first face.
 
-    What is not such a matrix is yielded under its name, which is not known.
+    For another value, 0 is yielded under `name`, which is an unknown channel.
     """
     numbers = list(_numbers(value))[:16]
     if not numbers:  # no face
@@ -166,7 +166,7 @@ def _numbers(value: Any) -> Iterator[float]:
 
 
 def time_column(file: Path, header: Sequence[str]) -> int:
-    """Return which column holds the time. Raises ConfigError where there is none."""
+    """Return the index of the time column. Raises ConfigError if there is none."""
     for place, name in enumerate(header):
         if _TIME_NAME.fullmatch(name):
             return place
@@ -176,9 +176,9 @@ def time_column(file: Path, header: Sequence[str]) -> int:
 
 
 def row_times(file: Path, name: str, cells: Sequence[str]) -> Doubles:
-    """Return seconds (N,), never less than in the row before; the same in a row that is there twice.
+    """Return the times (N,) of the rows [s], which never decrease; a repeated row has the time of the row before.
 
-    As written, or from the first row on for a time of day and for a clock that began long ago. Raises ConfigError.
+    Times are as written, or since the first row for a time of day or a clock that began long ago. Raises ConfigError.
     """
     match = _TIME_NAME.fullmatch(name)
     unit = match[1].lower() if match and match[1] else ""
@@ -206,7 +206,7 @@ def row_times(file: Path, name: str, cells: Sequence[str]) -> Doubles:
 
 
 def _timecodes(file: Path, name: str, cells: Sequence[str]) -> Doubles:
-    """Return seconds (N,) of HH:MM:SS:FF.fff, or of HH:MM:SS;FF, which leaves out counts so that 29.97 a second fit."""
+    """Return seconds (N,) of HH:MM:SS:FF.fff, or of HH:MM:SS;FF, which skips counts to fit 29.97 frames a second."""
     fields = [re.split("[:;]", cell) for cell in cells]
     for row, each in enumerate(fields, 2):
         if len(each) != 4:
@@ -217,14 +217,15 @@ def _timecodes(file: Path, name: str, cells: Sequence[str]) -> Doubles:
     counts = _counts_a_second(file, name, whole_s, frames)
     if not any(";" in cell for cell in cells):
         return whole_s + frames / counts
-    minute = whole_s // 60  # every one but each tenth begins with count 2, of 60 with count 4
+    minute = whole_s // 60  # every minute except each tenth begins at count 2, with 60 counts a second at count 4
     return (whole_s * counts + frames - counts // 15 * (minute - minute // 10)) * 1.001 / counts
 
 
 def _counts_a_second(file: Path, name: str, whole_s: Doubles, frames: Doubles) -> int:
-    """Return what a second has of counts: where one ends, the count falls by that, less the step of a row.
+    """Return the number of counts in a second: at its end the count falls by that number minus the step of a row.
 
-    Raises ConfigError where three seconds or more say something that is not within 1 % of a usual count.
+    Raises ConfigError if three or more ends of seconds yield a number that differs from a usual one by more than 1 %
+    and by more than 0.5.
     """
     steps, seconds = np.diff(frames), np.diff(whole_s)
     within, across = steps[(seconds == 0) & (steps > 0)], steps[seconds == 1]
@@ -243,15 +244,15 @@ def _counts_a_second(file: Path, name: str, whole_s: Doubles, frames: Doubles) -
 
 # --- OpenFace ---------------------------------------------------------------------------------------------------------
 
-# Facial action units (FACS: Ekman, Friesen and Hager 2002) and the ARKit shapes that name them; a unit has one
-# intensity for both sides of the face.
+# Facial action units (FACS: Ekman, Friesen and Hager 2002) and the ARKit shapes that correspond to them; a unit has
+# one intensity for both sides of the face.
 
 
 def _both(name: str) -> tuple[str, str]:
     return f"{name}Left", f"{name}Right"
 
 
-# FACS's name of the unit beside Apple's description of the shape.
+# The comments are FACS's names of the units, which were compared with Apple's descriptions of the shapes.
 SHAPES_OF_UNIT: Final[Mapping[int, tuple[str, ...]]] = {
     1: ("browInnerUp",),  # inner brow raiser
     2: _both("browOuterUp"),  # outer brow raiser
@@ -285,15 +286,15 @@ SHAPES_OF_UNIT: Final[Mapping[int, tuple[str, ...]]] = {
 
 
 def is_openface(header: Sequence[str]) -> bool:
-    """Return whether a table is OpenFace's: head pose about the axes of its camera."""
+    """Return whether a table is OpenFace's, with a head pose about the axes of its camera."""
     return {"pose_Rx", "pose_Ry", "pose_Rz"} <= set(header)
 
 
 def from_openface(file: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """Return OpenFace's table in our columns, the time first; rows without success are rows without a face.
+    """Convert OpenFace's table to our columns, the time first; rows without success have no face.
 
     Its camera has x to the viewer's right, y down, z away, and R = Rx Ry Rz (RotationHelpers.h). Not verified on a
-    recording. Intensities of 0 to 5 become 0 to 1; its place of the head is left out.
+    recording. Intensities of 0 to 5 become 0 to 1; the place of the head is not used.
     """
     numbers = {
         name: csv_numbers(file, name, [row[place] for row in rows])

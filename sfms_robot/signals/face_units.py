@@ -1,6 +1,6 @@
-"""Names and units of faces that come from elsewhere: files, the API, Live Link, VMC, the network.
+"""Names and units of faces from outside: files, the API, Live Link, VMC, the network.
 
-`channel_of` decides the names; `units_of`, `LiveUnits` and `beyond` the units.
+`channel_of` determines the names; `units_of`, `LiveUnits` and `beyond` the units.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _SHAPE_OF: Final[Mapping[str, str]] = {
 _MOST_NAMED: Final = 8
 
 _ANGLES: Final = slice(0, 3)
-_PARTS: Final = (3, 3, len(BLENDSHAPES))  # angles, place, shapes: channels of each
-_MOST_TURN_RAD: Final = 2.0  # further than a head turns; the same number of degrees is a small movement
+_PARTS: Final = (3, 3, len(BLENDSHAPES))  # number of channels of angles, place, shapes
+_MOST_TURN_RAD: Final = 2.0  # a head does not turn this far; in degrees the same number is a small movement
 _FASTEST_RAD_S: Final = 4.0  # on average; a head that is shaken fast reaches 3
 _RARE: Final = 0.05  # share of rows that a tracker may get wrong
 _DECIDED_S: Final = 1.0
 _WINDOW: Final = 256  # rows kept of the last second
-_SHAPE_RANGE: Final = (-0.5, 2.0)  # a tracker may overshoot 0..1, and is clipped
+_SHAPE_RANGE: Final = (-0.5, 2.0)  # a tracker may overshoot 0..1 by this; its values are clipped
 _MOST_MOVED_M: Final = 10.0
 
 
@@ -45,15 +45,15 @@ _MOST_MOVED_M: Final = 10.0
 def channel_of(name: str) -> str | None:
     """Return the channel of `frames.CHANNELS` that a tracker's name stands for, or None.
 
-    Any case; `Left`, `_L` and `L` are the same; what stands before a dot or a colon (`BlendShape.`) is left out. Head
-    pose goes as `HeadYaw`, `yaw`, `yaw_deg`: `pose_of` returns its unit.
+    Case is ignored; `Left`, `_L` and `L` are the same; text before a dot or a colon (`BlendShape.`) is ignored. Head
+    pose is named as `HeadYaw`, `yaw` or `yaw_deg`: `pose_of` returns its unit.
     """
     pose = pose_of(name)
     return pose[0] if pose else _SHAPE_OF.get(_SEPARATORS.sub("", re.split("[.:]", name)[-1]).lower())
 
 
 def pose_of(name: str) -> tuple[str, str, bool] | None:
-    """Return channel, unit ("" where the name has none) and whether a camera is the origin, of a head pose's name."""
+    """Return channel, unit ("" if the name has none) and whether a camera is the origin, from a head pose's name."""
     match = _POSE_NAME.fullmatch(name.strip())
     return (match[2].lower(), (match[3] or "").lower(), bool(match[1])) if match else None
 
@@ -81,7 +81,7 @@ def used_line(used: Collection[str], unknown: Collection[str]) -> str:
 
 @dataclass(frozen=True)
 class FaceUnits:
-    """Factors that turn a face's angles to radians and its blendshapes to 0..1."""
+    """Factors that convert a face's angles to radians and its blendshapes to 0..1."""
 
     angle: float = 1.0
     shape: float = 1.0
@@ -104,8 +104,8 @@ class FaceUnits:
 def units_of(motion: Floats | Doubles, times_s: Doubles) -> FaceUnits:
     """Decide the units of a face (N, 58) over all its rows, by what a head can do; rows of NaN are left out.
 
-    Angles are degrees where more than one row in twenty is beyond 2 rad, or where they change by more than 4 rad/s on
-    average. Blendshapes are percent where more than one row in twenty is beyond 2.
+    Angles are degrees if more than one row in twenty is beyond 2 rad, or if they change by more than 4 rad/s on
+    average. Blendshapes are percent if more than one row in twenty is beyond 2.
     """
     seen = np.isfinite(motion).all(axis=1)
     rows, at_s = np.asarray(motion, dtype=np.float64)[seen], np.asarray(times_s)[seen]
@@ -121,21 +121,21 @@ def units_of(motion: Floats | Doubles, times_s: Doubles) -> FaceUnits:
 
 @lru_cache(maxsize=8)
 def face_bounds(turn_rad: float) -> tuple[Doubles, Doubles]:
-    """Return the least and the most (58,) of a face in our units, not to be changed; `turn_rad`: the largest angle."""
+    """Return the lower and upper bounds (58,) of a face in our units, not to be changed; `turn_rad`: largest angle."""
     low, high = _SHAPE_RANGE
     least, most = (-turn_rad, -_MOST_MOVED_M, low), (turn_rad, _MOST_MOVED_M, high)
     return np.repeat(least, _PARTS), np.repeat(most, _PARTS)
 
 
 def expected_unit(place: int) -> str:
-    """Return what is expected of a channel, and in what a value beyond its bounds probably is."""
+    """Return the expected unit of a channel, and the probable unit of a value beyond its bounds."""
     return ("radians (in degrees?)", "metres (in cm or mm?)", "0 to 1 (in percent?)")[(place > 2) + (place > 5)]
 
 
 def beyond(motion: Floats | Doubles, turn_rad: float = _MOST_TURN_RAD) -> str | None:
-    """Return what is wrong with a face (58,) in our units: one line that names the channel, or None."""
+    """Return one line that names the first channel of a face (58,) out of bounds in our units, or None."""
     low, high = face_bounds(turn_rad)
-    inside = (motion >= low) & (motion <= high)  # NaN is in no range
+    inside = (motion >= low) & (motion <= high)  # NaN is outside of any range
     if inside.all():
         return None
     place = int(np.argmin(inside))
@@ -146,12 +146,12 @@ def beyond(motion: Floats | Doubles, turn_rad: float = _MOST_TURN_RAD) -> str | 
 
 
 class LiveUnits:
-    """Units of a live face, decided over its first second, and again when they turn out to be others.
+    """Units of a live face, decided over its first second, and again when they turn out to be wrong.
 
-    angles: False where the angles are known to be radians.
+    angles: False if the angles are known to be radians.
 
     Attributes:
-        units: as decided so far.
+        units: the units decided so far.
     """
 
     def __init__(self, angles: bool = True) -> None:
@@ -159,13 +159,13 @@ class LiveUnits:
         self.restart()
 
     def restart(self) -> None:
-        """Begin again: another sender."""
+        """Begin again, for another sender."""
         self.units = FaceUnits()
         self._rows = deque[tuple[float, Floats]](maxlen=_WINDOW)
         self._began_s: float | None = None
 
     def take(self, motion: Floats, time_s: float) -> Floats | None:
-        """Return a face (58,) in our units; None within the first second, and for one beyond what a head can do."""
+        """Return a face (58,) in our units; None in the first second, and for a face beyond what a head can do."""
         self._began_s = time_s if self._began_s is None else self._began_s
         self._rows.append((time_s, motion))
         while self._rows[0][0] < time_s - _DECIDED_S:

@@ -2,14 +2,14 @@
 
 The eyes leave first and arrive 40 to 120 ms later (the main sequence of saccades). The head follows with its share,
 which is near 0 below 8 degrees and grows with the angle of the target, on a minimum-jerk path (bell-shaped speed), and
-ends later. All the while the eyes make up for the head (vestibulo-ocular reflex): eye in head is gaze less
-head, also while the head nods or sways. On a target, the eyes wander over it in fixations of 228 ms (median) whose
-steps have 0.9 degrees (median), as people's do while they listen; a larger step is a gaze shift, decided elsewhere.
+ends later. Throughout, the eyes compensate for the head (vestibulo-ocular reflex): the angle of an eye in the head is
+gaze minus head, also while the head nods or sways. The eyes wander over a target in fixations of 228 ms (median) with
+steps of 0.9 degrees (median), as people's do while they listen; a larger step is a gaze shift, decided elsewhere.
 
-Laws: N frames at once are the N frames one by one. Gaze (head and eyes together) is within 3 degrees of the target
-200 ms after a shift of up to 30 degrees between targets that eyes can reach, and within 1.5 degrees during a nod of 8.
-The head's angle never jumps, and neither does its speed; on a still target its part stays where it is. Mirrored targets
-give a mirrored head, and mirrored eyes where they do not wander. Values that are not finite are refused.
+Laws: N frames at once equal the N frames one by one. Gaze (head and eyes together) is within 3 degrees of the target
+200 ms after a shift of up to 30 degrees between targets that eyes can reach, and within 1.5 degrees during a nod of 8
+degrees. The head's angle and speed never jump; on a still target the head's part is constant. Mirrored targets yield a
+mirrored head, and mirrored eyes if they do not wander. Values that are not finite are refused.
 
 Lids are not moved here: heads couple them with eyeLookUp and eyeLookDown.
 """
@@ -27,22 +27,22 @@ from numpy.typing import ArrayLike
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_S, POSE, Doubles, Floats, changed
 from sfms_robot.signals.minimum_jerk import ease, minimum_jerk
 
-EYE_PAN_RAD: Final = math.radians(30)  # of an eyeLook channel of 1, sideways
+EYE_PAN_RAD: Final = math.radians(30)  # angle of an eyeLook channel of 1, sideways
 EYE_TILT_RAD: Final = math.radians(20)
 EYES_RAD: Final = np.array([EYE_PAN_RAD, EYE_TILT_RAD])
-# Columns of a motion row that are the eyes' here.
+# Columns of a motion row that are set here for the eyes.
 EYE_CHANNELS: Final = tuple(
     CHANNEL_INDEX[f"eyeLook{way}{side}"] for side in ("Left", "Right") for way in ("Down", "In", "Out", "Up")
 )
-PURSUIT_RAD: Final = math.radians(1)  # a target that moves less is followed, one that moves more is shifted to
+PURSUIT_RAD: Final = math.radians(1)  # a smaller move of the target is followed; a larger one causes a gaze shift
 
-_EYES_ALONE_RAD: Final = math.radians(10)  # about what is left to the eyes
-_SHARES: Final = (0.5, 0.75)  # of the rest that is the head's, by person
-_TILT_SHARE: Final = 0.8  # of the pitch, less than of the yaw
-_ROLL: Final = -0.08  # of the yaw
-_SACCADE_S: Final = (0.021, 0.0022, 0.04, 0.12)  # at 0, more for each degree, least, most
-_HEAD_S: Final = (0.3, 0.012)  # at 0, more for each degree that it turns
-_SPOT_RAD: Final = (math.radians(0.55), math.radians(1.3))  # deviation and most, from the target, drift and all
+_EYES_ALONE_RAD: Final = math.radians(10)  # approximate angle that is left to the eyes
+_SHARES: Final = (0.5, 0.75)  # the head's share of the remaining angle, from person to person
+_TILT_SHARE: Final = 0.8  # factor of the head's share for pitch, which is smaller than for yaw
+_ROLL: Final = -0.08  # share of the yaw
+_SACCADE_S: Final = (0.021, 0.0022, 0.04, 0.12)  # duration at 0, increase per degree, least, most
+_HEAD_S: Final = (0.3, 0.012)  # duration at 0, increase per degree of its turn
+_SPOT_RAD: Final = (math.radians(0.55), math.radians(1.3))  # deviation from the target, and its limit including drift
 _DRIFT_RAD_S: Final = math.radians(0.2)
 _FIXATION_S: Final = (0.228, 0.48, 0.11)  # median, deviation of its logarithm, least
 
@@ -55,14 +55,15 @@ class GazeState:
     """State of eyes and head between two frames. Angles are in space, (yaw, pitch).
 
     Attributes:
-        seed: of the fixations.
-        wanders: eyes move over their target.
-        share: of the head, in the angle that is not left to the eyes.
-        target_rad: the last one.
+        seed: seed of the fixations.
+        wanders: True if the eyes move over their target.
+        share: the head's share of the angle that is not left to the eyes.
+        target_rad: the last target.
         gaze_rad: direction of head and eyes together.
         from_rad, shift_s, since_s: start, duration and elapsed time of the shift in progress.
-        number, spot_rad, drift_rad_s, left_s: of the fixation: its number, offset from the target, drift, time left.
-        head: the head's part, yaw and pitch; `head_left_s` until it arrives.
+        number, spot_rad, drift_rad_s, left_s: number of the fixation, offset from the target, drift, time left.
+        head: the head's part, yaw and pitch.
+        head_left_s: time until the head arrives.
     """
 
     seed: int
@@ -91,7 +92,7 @@ def follow(targets_rad: ArrayLike, poses: ArrayLike, state: GazeState) -> tuple[
 
     Args:
         targets_rad: (N, 2) yaw and pitch in space, (0, 0) at the person; from the beginning of each frame on.
-        poses: (N, 6) of the head without its part of the look, at the end of each frame.
+        poses: (N, 6) poses of the head without its part of the look, at the end of each frame.
 
     The head's part is roll, pitch, yaw [rad]; the eyes are values of `EYE_CHANNELS`, 0..1. Raises ValueError for a
     value that is not finite.
@@ -182,14 +183,14 @@ def _fixated(state: GazeState) -> GazeState:
     return changed(state, number=state.number + 1, spot_rad=spot, drift_rad_s=drift, left_s=left_s)
 
 
-@lru_cache(maxsize=1024)  # plans overlap: most fixations are needed by several
+@lru_cache(maxsize=1024)  # plans overlap: most fixations are needed by several plans
 def _drawn(seed: int, number: int) -> tuple[float, ...]:
     """Return the random numbers of one fixation."""
     return tuple(np.random.default_rng((seed, number)).standard_normal(5).tolist())
 
 
 def head_share(target_rad: Pair, share: float) -> Pair:
-    """Return the head's part (yaw, pitch) of a look at the target: near 0 in the middle, then `share`."""
+    """Return the head's part (yaw, pitch) of a look at the target: near 0 for small angles, then rising by `share`."""
     far = math.hypot(*target_rad)
     if far < 1e-9:
         return 0.0, 0.0
@@ -229,7 +230,7 @@ def directions(motion: Floats, full_rad: Doubles) -> Doubles:
 
 
 def turn(motion: Floats, directions_rad: Doubles, full_rad: Doubles) -> None:
-    """Write directions (..., 2, 2) into `motion` (..., 58), as far as the channels go."""
+    """Write directions (..., 2, 2) into `motion` (..., 58), limited to the range of the channels."""
     share = (directions_rad / full_rad).reshape(*motion.shape[:-1], 4)
     motion[..., _PLUS] = np.minimum(np.maximum(share, 0.0), 1.0)
     motion[..., _MINUS] = np.minimum(np.maximum(-share, 0.0), 1.0)

@@ -1,7 +1,7 @@
 """Log-mel spectrogram, causal: four rows of 128 bins for every 40 ms frame, one code path offline and streaming.
 
-Each row looks back over 25 ms and a new one is due every 10 ms. What a stream has to remember is the samples no
-finished row can do without: 240 of them after whole frames. The recording starts in silence.
+Each row looks back over 25 ms and a new one is due every 10 ms. A stream has to remember the samples that its next rows
+need: 240 of them after whole frames. A recording begins as if after silence.
 """
 
 from __future__ import annotations
@@ -19,31 +19,31 @@ HOP: Final = 160
 WINDOW: Final = 400
 FFT: Final = 512
 ROWS_PER_FRAME: Final = FRAME_SAMPLES // HOP  # 4
-LN_PER_DB: Final = math.log(10) / 10  # of power, whose natural logarithm the rows are
+LN_PER_DB: Final = math.log(10) / 10  # of power; the rows are its natural logarithm
 FLOOR: Final = 1e-6  # added to the power: about -80 dB below full scale
 
 
 def start() -> Floats:
-    """Past of a stream that has heard nothing: (240,) zeros."""
+    """Return the past of a new stream: (240,) zeros."""
     return np.zeros(WINDOW - HOP, dtype=np.float32)
 
 
 def log_mel(samples: Floats, past: Floats) -> tuple[Floats, Floats]:
-    """Rows that `samples` complete, and the past of the next call.
+    """Return the rows that `samples` complete, and the past of the next call.
 
     Args:
         samples: (n,) mono 16 kHz, -1..1; any n.
-        past: what the last call returned, or `start()`; not changed.
+        past: the past that the last call returned, or `start()`; not changed.
 
     Returns:
-        (rows, 128) natural log of mel power, and the samples to hand in next time (240 to 399 of them).
+        (rows, 128) natural log of mel power, and the samples to pass to the next call (240 to 399 of them).
     """
     rows, (after,) = log_mel_each([samples], [past])
     return rows, after
 
 
 def log_mel_each(samples: Sequence[Floats], pasts: Sequence[Floats]) -> tuple[Floats, list[Floats]]:
-    """`log_mel` of several streams: their rows, one stream behind the other, and the past of each."""
+    """Return `log_mel` of several streams: their rows, one stream after the other, and the past of each."""
     windows, after = [], []
     for new, past in zip(samples, pasts, strict=True):
         seen = np.concatenate([past, new]).astype(np.float32)
@@ -54,7 +54,7 @@ def log_mel_each(samples: Sequence[Floats], pasts: Sequence[Floats]) -> tuple[Fl
 
 
 def _rows(windows: Floats) -> Floats:
-    """(rows, 400) -> (rows, 128). Each row is added up alone: the result never depends on how many come at once."""
+    """Return the rows (rows, 128) of windows (rows, 400). Each is summed alone, so it never depends on their number."""
     spectrum = np.fft.rfft(windows * _HANN, FFT)
     power = spectrum.real**2 + spectrum.imag**2
     mel = np.add.reduceat(power[:, _BINS] * _WEIGHTS, _FIRST, axis=1)
@@ -68,7 +68,7 @@ def _mel(hz: Doubles | float) -> Doubles:
 def triangles(edges: Doubles, places: Doubles, least: float = 0.0) -> Doubles:
     """Return filters (K, N) at `places` (N,): each rises to 1 and falls to 0 over three of the edges (K + 2,).
 
-    `least`: width of each side.
+    `least`: least width of each side.
     """
     low, centre, high = edges[:-2, None], edges[1:-1, None], edges[2:, None]
     rise = (places - centre) / np.maximum(centre - low, least) + 1.0
@@ -77,7 +77,7 @@ def triangles(edges: Doubles, places: Doubles, least: float = 0.0) -> Doubles:
 
 
 def _filters() -> Doubles:
-    """(128, 257) triangles equally spaced in mel, each at least one FFT bin wide so that none is empty."""
+    """Return (128, 257) triangles equally spaced in mel, each at least one FFT bin wide so that none is empty."""
     edges_hz = 700.0 * (10 ** (np.linspace(_mel(20.0), _mel(AUDIO_HZ / 2), MEL_BINS + 2) / 2595.0) - 1.0)
     bins_hz = np.linspace(0, AUDIO_HZ / 2, FFT // 2 + 1)
     return triangles(edges_hz, bins_hz, float(bins_hz[1]))
@@ -85,6 +85,6 @@ def _filters() -> Doubles:
 
 _HANN: Final = np.hanning(WINDOW + 1)[:-1]
 _FILTERS: Final = _filters()
-_FILTER, _BINS = np.nonzero(_FILTERS)  # where filters are not 0, one after the other
+_FILTER, _BINS = np.nonzero(_FILTERS)  # filter and bin of each value that is not 0, one filter after the other
 _WEIGHTS: Final = _FILTERS[_FILTER, _BINS]
 _FIRST: Final = np.searchsorted(_FILTER, np.arange(MEL_BINS))

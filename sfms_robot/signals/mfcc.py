@@ -1,9 +1,9 @@
-"""The 78 numbers a frame that REACT's baselines hear: Kaldi MFCCs of each 40 ms on its own, no past and no future.
+"""The 78 features per frame of REACT's baselines: Kaldi MFCCs of each 40 ms frame alone, without past or future.
 
-A frame gives two windows of 25 ms, 10 ms apart; 13 cepstra each (the first is log energy), their deltas and the deltas
-of these, flattened as (3, 13, 2). As reactmultimodalchallenge/baseline_react2023 @ c5a8ff85 has it through
-torchaudio's port of Kaldi (compute-mfcc-feats with energy, without dither), on samples within -1..1: speech is mostly
-under Kaldi's energy floor of 1, so the first cepstrum is mostly 0 there and here.
+A frame has two windows of 25 ms, 10 ms apart, with 13 cepstra each (the first is log energy). The features are these,
+their deltas and the deltas of the deltas, flattened as (3, 13, 2). reactmultimodalchallenge/baseline_react2023 @
+c5a8ff85 computes them by torchaudio's port of Kaldi (compute-mfcc-feats with energy, without dither), on samples within
+-1..1: speech is mostly below Kaldi's energy floor of 1, so the first cepstrum is mostly 0 there and here.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ EPSILON: Final = float(np.finfo(np.float32).eps)
 def mfcc78(samples: Floats) -> Floats:
     """Return (frames, 78) of samples (n,) mono 16 kHz -1..1, one row for every whole frame of 40 ms.
 
-    Frames share nothing: streaming is the same call.
+    Frames are independent of one another, so a stream uses the same call.
     """
     frames = len(samples) // FRAME_SAMPLES
     chunks = samples[: frames * FRAME_SAMPLES].reshape(frames, FRAME_SAMPLES).astype(np.float64)
-    cut = np.lib.stride_tricks.sliding_window_view(chunks, WINDOW, axis=1)[:, ::HOP]  # snipped edges
+    cut = np.lib.stride_tricks.sliding_window_view(chunks, WINDOW, axis=1)[:, ::HOP]  # Kaldi's snip-edges
     static = np.moveaxis(cepstra(cut), 1, 2)[..., :2]  # (frames, 13, 2)
     delta = deltas(static)
     return np.asarray(np.stack([static, delta, deltas(delta)], axis=1).reshape(frames, DIM), dtype=np.float32)
 
 
 def cepstra(windows: Reals) -> Doubles:
-    """Return (..., 13) of windows (..., 400): Kaldi's defaults with energy in place of the first."""
+    """Return cepstra (..., 13) of windows (..., 400): Kaldi's defaults, with log energy in place of the first."""
     centred = windows - windows.mean(axis=-1, keepdims=True)
     energy = np.log(np.maximum(np.square(centred).sum(axis=-1), ENERGY_FLOOR))
     before = np.concatenate([centred[..., :1], centred[..., :-1]], axis=-1)
     povey = np.hanning(WINDOW) ** 0.85
     power = np.abs(np.fft.rfft((centred - PREEMPHASIS * before) * povey, FFT)) ** 2
     logs = np.log(np.maximum(power[..., :-1] @ _filters().T, EPSILON))
-    from scipy.fft import dct  # a quarter of a second, and few listeners hear these features
+    from scipy.fft import dct  # takes a quarter of a second, and few listeners use these features
 
     out: Doubles = dct(logs, type=2, norm="ortho", axis=-1)[..., :CEPSTRA]
     out = out * (1.0 + 0.5 * LIFTER * np.sin(np.pi * np.arange(CEPSTRA) / LIFTER))
@@ -65,7 +65,7 @@ def deltas(values: Doubles) -> Doubles:
 
 @lru_cache
 def _filters() -> Doubles:
-    """Return (23, 256) triangles equally spaced in mel from 20 Hz up; the bin at half the rate takes no part."""
+    """Return (23, 256) triangles equally spaced in mel from 20 Hz up; the bin at half the rate is not used."""
     edges = np.linspace(_mel(LOW_HZ), _mel(AUDIO_HZ / 2), MEL_BINS + 2)
     return triangles(edges, _mel(np.arange(FFT // 2) * AUDIO_HZ / FFT))
 

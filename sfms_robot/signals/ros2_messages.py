@@ -1,6 +1,6 @@
 """The messages of ROS 2 that this program exchanges: definitions, type hashes, CDR, and faces as action units.
 
-The definitions are the fields of the `.msg` files, without their constants and comments, which no hash covers:
+The definitions are the fields of the `.msg` files without constants and comments, which are not part of the hash:
 
     builtin_interfaces      github.com/ros2/rcl_interfaces, Apache-2.0
     std_msgs, sensor_msgs, geometry_msgs, diagnostic_msgs
@@ -9,10 +9,10 @@ The definitions are the fields of the `.msg` files, without their constants and 
     audio_common_msgs       github.com/ros-drivers/audio_common 06c280a, BSD-3-Clause
 
 CDR (OMG formal/02-06-51, as plain XCDR1): four bytes 00 01 00 00, then the fields in order, little-endian. A number
-stands at a multiple of its size, counted behind the four bytes; a text is its length with the closing 0, then both; a
-list is a count, then the items. An empty list of 8-byte numbers has no padding.
+begins at a multiple of its size, counted from the end of the four bytes. A text is its length including the final 0,
+then the text and the 0; a list is a count, then the items. An empty list of 8-byte numbers has no padding.
 
-A message is a dictionary by field; fields that are left out are 0, empty, or such a message.
+A message is a dictionary by field name; missing fields are 0, empty, or a message of such fields.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
 AUDIO: Final = "audio_common_msgs/msg/AudioDataStamped"
 POINT: Final = "geometry_msgs/msg/PointStamped"
 
-# What a run says in ROS's own types, live and in recordings.
+# Topics that a run publishes in ROS's own types, live and in recordings, and their types.
 TYPED_TOPICS: Final[Mapping[str, str]] = {
     "/joint_states": JOINT_STATE,
     "/robot_face/action_units": ACTION_UNITS,
@@ -112,7 +112,7 @@ MSG: geometry_msgs/PointStamped
 std_msgs/Header header
 geometry_msgs/Point point
 """
-# numpy's type, and REP 2016's number, of each primitive type; a text has 17, a message 1.
+# numpy's type and REP 2016's number of each primitive type; a text has the number 17, a message 1.
 _NUMBERS: Final[Mapping[str, tuple[str, int]]] = {
     "uint8": ("u1", 3),
     "int32": ("<i4", 6),
@@ -123,7 +123,7 @@ _NUMBERS: Final[Mapping[str, tuple[str, int]]] = {
 }
 _TEXT: Final = "string"
 _BEGIN: Final = b"\x00\x01\x00\x00"
-_LEAST_TEXT: Final = 4  # bytes
+_LEAST_TEXT: Final = 4  # bytes of the shortest text
 _PADDING: Final = 3  # bytes that some writers add at the end
 
 Message = dict[str, Any]
@@ -167,7 +167,7 @@ def _inner(kind: str) -> tuple[str, ...]:
 
 
 def schema_text(kind: str) -> str:
-    """Return the definition of a message and of those inside it, as an MCAP schema `ros2msg` has it."""
+    """Return the definition of a message and of those inside it, in the format of an MCAP schema `ros2msg`."""
     inner = (f"{_RULE}\nMSG: {name.replace('/msg/', '/')}\n{_texts()[name]}" for name in _inner(kind))
     return _texts()[kind] + "".join(inner)
 
@@ -192,12 +192,12 @@ def _description(kind: str) -> Message:
 
 
 def wire_name(kind: str, hashed: bool = True) -> str:
-    """Return type and hash as keys of rmw_zenoh have them; ROS 2 Humble has no hashes."""
+    """Return type and hash in the form of the keys of rmw_zenoh; ROS 2 Humble has no hashes."""
     return f"{kind.replace('/msg/', '::msg::dds_::')}_/{type_hash(kind) if hashed else NO_HASH}"
 
 
 def read_message(kind: str, wire: str, data: bytes) -> Message:
-    """Return a message of this kind. Raises PacketError for another type or hash, and as `from_cdr`."""
+    """Parse a message of this kind. Raises PacketError for another type or hash, and as `from_cdr`."""
     sort, _, found = wire.partition("/")
     if not wire_name(kind).startswith(f"{sort}/"):
         raise PacketError(f"expected {kind}, got {sort.replace('::msg::dds_::', '/msg/').rstrip('_')}")
@@ -210,7 +210,7 @@ def read_message(kind: str, wire: str, data: bytes) -> Message:
 
 
 def to_cdr(kind: str, message: Message) -> bytes:
-    """Return a message as CDR. Raises ValueError for an array of another length."""
+    """Return a message as CDR. Raises ValueError for an array of the wrong length."""
     out = bytearray()
     _write(out, kind, message)
     return _BEGIN + bytes(out)
@@ -250,9 +250,9 @@ def _write_numbers(out: bytearray, dtype: str, values: Any) -> None:
 
 
 def from_cdr(kind: str, data: bytes) -> Message:
-    """Return the message that CDR holds; lists of numbers as arrays. Raises PacketError, in one line, for other bytes.
+    """Parse a message in CDR; lists of numbers become arrays. Raises PacketError, in one line, for other bytes.
 
-    No count is believed beyond the bytes that are there.
+    A count that needs more bytes than there are is refused.
     """
     if data[: len(_BEGIN)] != _BEGIN:
         raise PacketError(
@@ -267,7 +267,7 @@ def from_cdr(kind: str, data: bytes) -> Message:
 
 @dataclass
 class CdrReader:
-    """A place in the bytes of a message, behind the first four."""
+    """A reader with a position in the bytes of a message after the first four."""
 
     kind: str
     data: memoryview
@@ -283,7 +283,7 @@ class CdrReader:
             count = self._count(name)
         if part in _NUMBERS:
             return self._numbers(name, _NUMBERS[part][0], count)
-        if count * _LEAST_TEXT > len(self.data) - self.at:  # a text, or a message that has one
+        if count * _LEAST_TEXT > len(self.data) - self.at:  # items are texts, or messages that contain a text
             raise PacketError(f"{self.kind}: {name}: expected {count} items, got {len(self.data) - self.at} bytes")
         return [self._one(name, part) for _ in range(count)]
 
@@ -318,7 +318,7 @@ _LEVELS: Final = {"degraded": 1, "halted": 1, "fault": 2}  # WARN, ERROR; 0 is O
 
 
 def diagnostics(head: Message, state: str, values: Mapping[str, Any]) -> Message:
-    """Return the state of a run, and its figures, as a DiagnosticArray."""
+    """Return the state of a run and its figures as a DiagnosticArray."""
     pairs = [{"key": key, "value": str(value)} for key, value in values.items()]
     status = {"level": _LEVELS.get(state, 0), "name": "sfms_robot: run", "message": state, "values": pairs}
     return {"header": head, "status": [status]}
@@ -328,7 +328,7 @@ def diagnostics(head: Message, state: str, values: Mapping[str, Any]) -> Message
 
 UNITS: Final = 99
 HEAD_FULL_RAD: Final = math.pi / 4  # our choice: FACS gives no angle for a unit of full intensity
-# Units of the head in the positive and the negative direction of a channel.
+# Units of the head for the positive and the negative direction of a channel.
 _HEAD_UNITS: Final = {"yaw": (51, 52), "pitch": (54, 53), "roll": (56, 55)}
 _PLACES: Final = {unit: [CHANNEL_INDEX[name] for name in names] for unit, names in SHAPES_OF_UNIT.items()}
 _KNOWN: Final = [*_PLACES, *(unit for both in _HEAD_UNITS.values() for unit in both)]
@@ -337,7 +337,7 @@ _KNOWN: Final = [*_PLACES, *(unit for both in _HEAD_UNITS.values() for unit in b
 def units_of(motion: Floats) -> Message:
     """Return intensity and confidence (99,) of the action units of a face (58,), 0..1; the stronger side counts.
 
-    The confidence is 1 for units that a face has here, else 0: not detected.
+    The confidence is 1 for units that this program computes, else 0: not detected.
     """
     intensity, confidence = np.zeros((2, UNITS), np.float32)
     for unit, places in _PLACES.items():
@@ -350,7 +350,7 @@ def units_of(motion: Floats) -> Message:
 
 
 def face_of(message: Message) -> Floats:
-    """Return the face (58,) of action units whose confidence is above 0; what is not finite stays so."""
+    """Return the face (58,) of action units whose confidence is above 0; values that are not finite stay so."""
     motion = NEUTRAL.copy()
     intensity = np.where(message["confidence"] > 0, message["intensity"], np.float32(0))
     for unit, places in _PLACES.items():
@@ -360,8 +360,8 @@ def face_of(message: Message) -> Floats:
     return motion
 
 
-_SHOWN: Final = 0.25  # mean intensity of its units, from which an expression is named
-# Units of each expression (EMFACS), and where it lies on the axes of valence and arousal (Russell 1980; rounded).
+_SHOWN: Final = 0.25  # mean intensity of its units from which on an expression is named
+# Units of each expression (EMFACS), and its valence and arousal (Russell 1980; rounded).
 _EXPRESSIONS: Final[Mapping[str, tuple[tuple[int, ...], float, float]]] = {
     "happy": ((12,), 0.8, 0.4),
     "surprised": ((1, 2, 5, 26), 0.2, 0.8),
@@ -373,7 +373,7 @@ _EXPRESSIONS: Final[Mapping[str, tuple[tuple[int, ...], float, float]]] = {
 
 
 def expression_of(intensity: Floats) -> Message:
-    """Return the expression that action units (99,) are nearest to, "neutral" where none is strong."""
+    """Return the expression nearest to action units (99,), "neutral" if none is strong."""
     scores = {name: float(intensity[list(units)].mean()) for name, (units, _, _) in _EXPRESSIONS.items()}
     name = max(scores, key=lambda each: scores[each])
     score = scores[name]

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from sfms_robot.frames import Doubles, Reals
 
-FROM_CAMERA: Final = [2, 0, 1]  # axes of a camera that are ours: z towards the viewer, x to the picture's right, y up
-AXIS: Final = {"roll": 0, "pitch": 1, "yaw": 2}  # the coordinate axis that each one turns about
+FROM_CAMERA: Final = [2, 0, 1]  # a camera's axes for our x, y, z: z towards the viewer, x to the picture's right, y up
+AXIS: Final = {"roll": 0, "pitch": 1, "yaw": 2}  # the coordinate axis of each rotation
 
 
 def rotation(rpy_rad: Doubles) -> Doubles:
@@ -50,7 +50,7 @@ def about(axis: int, angle_rad: ArrayLike) -> Doubles:
 def euler(matrix: Doubles, axes: tuple[int, int, int]) -> Doubles:
     """Return the angles (..., 3) with R(axes[0]) R(axes[1]) R(axes[2]) = matrix, for three different axes.
 
-    The middle angle is within +-pi/2. Where it is exactly there the other two are not defined apart: the last is 0.
+    The middle angle is within +-pi/2. At exactly +-pi/2 the other two are not defined separately: the last is 0.
     """
     a, b, c = axes
     sign = 1.0 if (b - a) % 3 == 1 else -1.0

@@ -1,11 +1,11 @@
-"""Face-track files: CSV (also gzipped), JSON and OpenFace's, read as motion in our units and axes.
+"""Face-track files: CSV (also gzipped), JSON and OpenFace's tables, read as motion in our units and axes.
 
-Columns go by name (`face_units.channel_of`), so the column order of the Live Link app, of its UDP packet, of Apple's
-header and of MediaPipe all read the same. Head pose columns carry their unit in the name (`headYaw_deg`, `x_m`, ...);
-without one angles are radians or degrees by what a head can do, and places metres. Axes of other sources are turned
-into ours.
+Columns are found by name (`face_units.channel_of`), so the column orders of the Live Link app, its UDP packet, Apple's
+header and MediaPipe are all accepted. Head pose columns have the unit in their name (`headYaw_deg`, `x_m`, ...). If it
+is missing, angles are radians or degrees, decided by what a head can do, and places are metres. Axes of other sources
+are converted to ours.
 
-A row of NaN means: no face was seen.
+A row of NaN means that no face was seen.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ from sfms_robot.signals.face_units import channel_of, expected_unit, face_bounds
 logger = logging.getLogger(__name__)
 
 
-# Sources turn yaw first, then pitch, then roll, about up, left and forward: R = Rz(yaw) Ry(pitch) Rx(roll), and so do
-# we. A source whose columns begin with "head" measures from a camera: x to the viewer's right, y up, z to the viewer.
-# Of MediaPipe that is proved (R = Ry(yaw) Rx(pitch) Rz(roll) of the face transform), of Live Link it is not: in
+# Sources rotate by yaw first, then pitch, then roll, about up, left and forward: R = Rz(yaw) Ry(pitch) Rx(roll), as we
+# do. A source whose columns begin with "head" measures from a camera: x to the viewer's right, y up, z to the viewer.
+# For MediaPipe that is proved (R = Ry(yaw) Rx(pitch) Rz(roll) of the face transform), for Live Link it is not: in
 # think-biq/LLV @ 07ec14c examples/dao.gesichter the eyes turn against HeadYaw (r = -0.95 with the look-left channels),
-# as they do when a face keeps looking at its phone, a hint that + is own left.
-_FROM_CAMERA: Final = {"z": "x", "x": "y", "y": "z"}  # its axis -> ours
+# as they do when a face keeps looking at its phone, which suggests that + is the face's own left.
+_FROM_CAMERA: Final = {"z": "x", "x": "y", "y": "z"}  # the camera's axis -> ours
 
 _UNITS: Final = {"deg": math.pi / 180, "rad": 1.0, "m": 1.0, "cm": 0.01, "mm": 0.001}
-# Rotations of the eyes, which blendshapes have too, and counts beside them.
+# Columns that are not needed: rotations of the eyes, which are in the blendshapes too, and counts.
 _NOT_NEEDED: Final = re.compile(r"(left|right)eye(yaw|pitch|roll)|blendshapecount|_neutral|subject", re.IGNORECASE)
 _LONGEST_GAP_S: Final = 0.25  # rows further apart than this have a lost face between them
 _ANGLES: Final = ("roll", "pitch", "yaw")
@@ -68,7 +68,7 @@ _TIME_EPS_S: Final = 1e-6
 
 
 class _Column(NamedTuple):
-    """A column of the file. `factor` to our unit; NaN for an angle whose name has no unit."""
+    """A column of the file. `factor`: factor to our unit; NaN for an angle whose name has no unit."""
 
     place: int
     factor: float
@@ -81,7 +81,7 @@ class Track:
     Attributes:
         times_s: (N,) increasing.
         motion: (N, 58) radians, metres, 0..1; a row of NaN where no face was seen.
-        known: names of the channels the file had; the others are 0.
+        known: names of the channels in the file; the others are 0.
     """
 
     times_s: Doubles
@@ -153,8 +153,8 @@ def write_track(path: Path | str, track: Track) -> None:
 def resample(track: Track, rate_hz: float, start_s: float = 0.0) -> Track:
     """Return the track at start_s, start_s + 1/rate_hz, ... up to its last row.
 
-    Linear in time; a blink takes its maximum over the interval that ends at the instant, so that none falls between
-    frames. NaN before the first row and wherever a neighbour is NaN or more than 0.25 s away.
+    Linear in time; a blink has its maximum over the interval that ends at the instant, so that none is lost between
+    frames. NaN before the first row, and where a neighbouring row is NaN or these rows are more than 0.25 s apart.
     """
     count = max(0, math.floor((track.duration_s - start_s) * rate_hz + _TIME_EPS_S * rate_hz) + 1)
     grid_s = start_s + np.arange(count) / rate_hz
@@ -183,7 +183,7 @@ def resample(track: Track, rate_hz: float, start_s: float = 0.0) -> Track:
 def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_at: int) -> list[list[str]]:
     """Return rows as long as the header; an incomplete last row is left out.
 
-    A row that ends with its time, or with a count of 0 after it, has lost the face: Live Link writes such rows.
+    A row that ends after its time, or after a count of 0 behind the time, has no face: Live Link writes such rows.
     """
     lost = [""] * (len(header) - time_at - 1)
     ends = time_at + 1
@@ -200,7 +200,7 @@ def _even(file: Path, header: Sequence[str], rows: list[list[str]], time_at: int
 def _columns(file: Path, header: Sequence[str]) -> tuple[dict[str, _Column], bool]:
     """Return the column of each of our channels in the file, and whether its pose is measured from a camera.
 
-    Columns that are not used are named in the log.
+    Unused columns are named in the log.
     """
     poses = {name: pose for name in header if (pose := pose_of(name)) is not None}
     from_camera = any(camera for _, _, camera in poses.values())
@@ -231,7 +231,7 @@ def _columns(file: Path, header: Sequence[str]) -> tuple[dict[str, _Column], boo
 
 
 def _in_our_units(file: Path, motion: Doubles, times_s: Doubles, columns: Mapping[str, _Column]) -> Doubles:
-    """Return motion (N, 58) in radians and 0..1: units that no name declares are decided over all rows."""
+    """Return motion (N, 58) in radians and 0..1; units missing in the column names are decided over all rows."""
     is_open = np.array([name in columns and math.isnan(columns[name].factor) for name in _ANGLES])
     undecided, angles = motion.copy(), slice(0, len(_ANGLES))
     undecided[:, angles] *= is_open

@@ -1,9 +1,9 @@
-"""Voice activity by energy over a floor and under a ceiling that both adapt; causal, one frame at a time.
+"""Voice activity from the energy relative to a floor and a ceiling that both adapt; causal, one frame at a time.
 
 The state has to be a value that can be copied, as all memory of streams here, which rules out libraries with hidden
-state. Levels are dB of full scale, but only differences count, so that the energy of
-samples and that of mel rows both serve, at any gain. On composed dyads 89 of 100 phrase ends that it reports are true,
-and it misses one of a hundred.
+state. Levels are dB of full scale, but only differences count, so that the energy of samples and that of mel rows can
+both be used, at any gain. On composed dyads 89 of 100 phrase ends that it reports are true, and it misses one of a
+hundred.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from sfms_robot.frames import FRAME_S, FRAME_SAMPLES, Doubles, Floats
 from sfms_robot.signals.audio import energies_db
 
-SILENT_DB: Final = -75.0  # the floor never sinks further: digital silence would make a whisper of hum loud
+SILENT_DB: Final = -75.0  # lower limit of the floor: after digital silence a faint hum would count as loud
 ABOVE_FLOOR_DB: Final = 5.0
-BELOW_PEAK_DB: Final = (10.0, 34.0)  # and the threshold keeps between these distances under the loud parts
-HYSTERESIS_DB: Final = 3.0  # once speaking, soft syllables belong to it
-_RISE_DB: Final = 0.7 * FRAME_S  # of the floor: slow, or the dips of a long phrase would become it
-_DECAY_DB: Final = 0.5 * FRAME_S  # of the peak: a person who sat back is detected within a minute
-_ATTACK: Final = 0.5  # share of the way to a new extreme that one frame takes: a click is no voice
+BELOW_PEAK_DB: Final = (10.0, 34.0)  # least and greatest distance of the threshold below the loud parts
+HYSTERESIS_DB: Final = 3.0  # the threshold is lower during speech, so that soft syllables belong to it
+_RISE_DB: Final = 0.7 * FRAME_S  # rise of the floor: slow, or it would follow the dips of a long phrase
+_DECAY_DB: Final = 0.5 * FRAME_S  # fall of the peak: a person who moved further away is detected within a minute
+_ATTACK: Final = 0.5  # share of the way to a new extreme per frame, so that a click is not a voice
 _FRAMES: Final = 2  # this many loud frames in a row are speech
 _MEL_DB: Final = 25.0  # mean mel power of white noise over its mean square (signals.mel: window, filters)
 
@@ -47,12 +47,12 @@ class Ear:
 
 
 def start() -> Ear:
-    """Return the memory of a new stream; the floor comes down, so that the first noise does not count as speech."""
+    """Return the memory of a new stream; its floor is high and falls, so that first noise does not count as speech."""
     return Ear(-35.0, -20.0, 0)
 
 
 def step(level_db: float, ear: Ear) -> Ear:
-    """Return the memory after 40 ms, `.active` if they are speech. A level that is not finite counts as silence."""
+    """Return the memory after a frame, `.active` if it is speech. A level that is not finite counts as silence."""
     level = max(level_db, SILENT_DB) if math.isfinite(level_db) else SILENT_DB
     fall = level < ear.floor_db
     floor = ear.floor_db + (_ATTACK * (level - ear.floor_db) if fall else min(_RISE_DB, level - ear.floor_db))

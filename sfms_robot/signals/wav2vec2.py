@@ -1,14 +1,14 @@
-"""wav2vec2 of each 40 ms frame, from a model folder on disk; one path offline and streaming.
+"""wav2vec2 features of each 40 ms frame, from a model folder on disk; one code path offline and streaming.
 
-The transformer sees a whole recording at once, the future included. A listener takes a stream, so each frame gets a
-separate window: the last 50 frames (2 s) and 80 samples, so that the last two latents end with the frame; their mean is
-the frame's feature. That is a pass over 2 s a frame: a GPU keeps up with a stream, a processor does not.
+The transformer processes a whole recording at once, including the future. A listener receives a stream, so each frame
+has a separate window: the last 50 frames (2 s) and 80 samples, so that the last two latents end with the frame; their
+mean is the frame's feature. That is a pass over 2 s per frame: a GPU keeps up with a stream, a CPU does not.
 
-With a hop of h frames one pass gives h rows, when the last of them is complete, for an h-th of the cost: a listener
-that plans every h frames loses nothing. Its windows are h - 1 frames longer, so that every row has its 2 s.
+With a hop of h frames one pass returns h rows when the last of them is complete, at 1/h of the cost: a listener that
+plans every h frames loses nothing. Its windows are h - 1 frames longer, so that every row has its 2 s.
 
-Ours, because rows of a whole recording know the future: REACT's baselines run whole recordings and stretch 50 latents a
-second to 25.
+This scheme is ours, because rows of a whole recording contain the future: REACT's baselines process whole recordings
+and stretch 50 latents a second to 25.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from sfms_robot.errors import ModelError, first_line, optional
 from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats, Indices
 
 CONTEXT_FRAMES: Final = 50
-STRIDE: Final = 320  # samples a latent
-FIELD: Final = 400  # samples the last latent sees
+STRIDE: Final = 320  # samples from one latent to the next
+FIELD: Final = 400  # samples that a latent sees
 WINDOW: Final = CONTEXT_FRAMES * FRAME_SAMPLES + FIELD - STRIDE  # 32,080, at a hop of one frame
 LATENTS_PER_FRAME: Final = FRAME_SAMPLES // STRIDE
 BATCH: Final = 16
@@ -33,7 +33,7 @@ FILES: Final = ("config.json", "preprocessor_config.json", "model.safetensors", 
 
 
 class Wav2Vec2:
-    """A wav2vec2 model of a local folder. Holds weights; the past of a stream is a value of the caller."""
+    """A wav2vec2 model from a local folder. Holds weights only; the caller keeps the past of a stream."""
 
     def __init__(self, folder: Path | str, device: str = "cpu", hop_frames: int = 1) -> None:
         """Load the model. Raises MissingExtra without transformers, ModelError for a folder without such a model."""
@@ -84,8 +84,8 @@ class Wav2Vec2:
     def of_recording(self, samples: Floats, fps: float = FRAME_HZ) -> Floats:
         """Return the rows (frames, dim) of a whole recording.
 
-        At 25 fps those of a stream; a last hop that is not complete ends in silence. At other rates windows end with
-        their frame, which takes a hop of one: raises ValueError for others.
+        At 25 fps they equal those of a stream; an incomplete last hop is filled up with silence. At other rates each
+        window ends with its frame, which needs a hop of one frame: raises ValueError for other hops.
         """
         if fps != FRAME_HZ and self.hop_frames != 1:
             raise ValueError(f"a hop of {self.hop_frames} frames needs data at {FRAME_HZ} fps, not {fps:g}")

@@ -1,7 +1,7 @@
-"""The face of a live person: the value of `--face`, faces of a tracker as they arrive to `Sighting`s, and UDP senders.
+"""The face of a live person: the value of `--face`, conversion of a tracker's faces to `Sighting`s, and UDP senders.
 
-The flag is `--face KIND[:PLACE][,flip=CHANNEL+CHANNEL]`. PLACE is the kind's own: a UDP port, a camera. `flip` turns
-the sign of pose channels that a tracker has the other way round: `live-link:11111,flip=yaw+roll`.
+The flag is `--face KIND[:PLACE][,flip=CHANNEL+CHANNEL]`. PLACE depends on the kind: a UDP port, a camera. `flip`
+inverts pose channels that a tracker sends with the opposite sign: `live-link:11111,flip=yaw+roll`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ REMEMBERED_S: Final = 120.0
 AWAY_S: Final = 10.0
 _SAMPLE_S: Final = 0.5
 _SAMPLES: Final = int(REMEMBERED_S / _SAMPLE_S)
-_EASE_S: Final = 0.5  # time constant with which rest follows its estimate: a face never jumps
+_EASE_S: Final = 0.5  # time constant with which the rest follows its estimate, so that a face never jumps
 _SHAPE_QUANTILE: Final = 0.2
 _HIGHEST_REST: Final = 0.5  # a shape held above this is an expression, however long it lasts
 _MEDIANS: Final = [i for i, name in enumerate(CHANNELS) if name not in BLENDSHAPES or name.startswith("eyeLook")]
@@ -61,11 +61,11 @@ AS_SENT: Final[Floats] = np.ones(len(POSE_CHANNELS), np.float32)  # signs of the
 PACKETS_PER_CALL: Final = 64
 LONGEST_CALL_S: Final = 0.002
 LONGEST_PACKET: Final = 16_384  # bytes; a longer one is cut off and counts as malformed
-LOST_S: Final = 0.5  # five packets of one that sends ten a second
-SILENT_S: Final = 2.0  # after so long another sender may take over, and what is left out of a new one is logged
-USUAL_PORTS: Final = {"vmc": 39539, "live-link": 11111}  # what the protocol, and the app, suggest
+LOST_S: Final = 0.5  # five packets of a sender that sends ten a second
+SILENT_S: Final = 2.0  # silence before another sender is accepted; delay before a new one's unused data is logged
+USUAL_PORTS: Final = {"vmc": 39539, "live-link": 11111}  # suggested by the protocol, and by the app
 ANY: Final = ("0.0.0.0", "::")  # every address of this machine
-UNHEARD_S: Final = 5.0  # into a run without a sender, what to type there is logged
+UNHEARD_S: Final = 5.0  # time of a run without a sender after which the log explains how to send
 # Packets of other programs, and what to do about them.
 _FOREIGN: Final = (
     (rb"/(W|HT|HRQ?|ELR|ERR)\0", "Face Cap in live mode, which has no VMC: use Live Link Face and --face live-link"),
@@ -76,23 +76,23 @@ _FOREIGN: Final = (
     (rb"\s*\{", "JSON, which is not read here: choose Live Link Face or VMC in the app that sends it"),
 )
 
-# Linux says when a datagram came in, to the nanosecond of the wall clock; Python has no name for the option.
+# Linux reports when a datagram arrived, in nanoseconds of the wall clock; Python has no name for the socket option.
 _SO_TIMESTAMPNS: Final = 35
 _TIMESPEC: Final = struct.Struct("@ll")
-_OLDEST_S: Final = 5.0  # a datagram that seems older, or of the future: the wall clock was set meanwhile
+_OLDEST_S: Final = 5.0  # if a datagram seems older, or from the future, the wall clock was set in the meantime
 
 
 def parse_face_argument(kind: str, argument: str) -> tuple[str, Floats]:
-    """Return PLACE, "" where none is given, and (6,): -1 for every pose channel to flip, 1 for the others.
+    """Return PLACE ("" if it is missing) and the signs (6,) of the pose channels: -1 for those to flip, else 1.
 
-    `argument`: the text behind `KIND:`. Raises ConfigError for another option, and for an unknown channel.
+    `argument`: the text after `KIND:`. Raises ConfigError for an unknown option or channel.
     """
     place, given = split_options(f"--face {kind}", argument, "flip")
     return place, pose_signs(kind, given)
 
 
 def split_options(flag: str, argument: str, *known: str) -> tuple[str, list[tuple[str, str]]]:
-    """Return an argument without its options (`,name=value`), and these, the last one first.
+    """Return an argument without its options (`,name=value`), and the options, the last one first.
 
     Raises ConfigError for an option that is not `known`.
     """
@@ -107,7 +107,7 @@ def split_options(flag: str, argument: str, *known: str) -> tuple[str, list[tupl
 
 
 def pose_signs(kind: str, options: Iterable[tuple[str, str]]) -> Floats:
-    """Return the sign of each pose channel, by the options `flip` of `--face KIND`. Raises ConfigError."""
+    """Return the sign of each pose channel, from the options `flip` of `--face KIND`. Raises ConfigError."""
     signs = AS_SENT.copy()
     for channel in [each for name, value in options if name == "flip" for each in value.split("+")]:
         if channel not in POSE_CHANNELS:
@@ -119,10 +119,10 @@ def pose_signs(kind: str, options: Iterable[tuple[str, str]]) -> Floats:
 
 
 class LiveFace(SourcePart):
-    """`ports.Sight` of faces that are put: motion (58,) with its time; the person's rest is taken off.
+    """A `ports.Sight` of faces passed to `put`: motion (58,) with its time, made relative to the person's rest.
 
-    Several faces between two questions become one, the newest, with the strongest blink of all: none falls between
-    frames. All methods may be called from any thread.
+    Several faces between two calls of `at` become one: the newest, with the strongest blink of all, so that no blink is
+    lost between frames. All methods may be called from any thread.
 
     signs: (6,) factors of the pose channels.
     """
@@ -135,22 +135,22 @@ class LiveFace(SourcePart):
         self._sighting: Sighting | None = None
 
     def start(self, origin_s: float) -> None:
-        """Set loop time 0 to `origin_s` of `time.monotonic`. The person's rest stays known."""
+        """Set loop time 0 to `origin_s` of `time.monotonic`. The person's rest is kept."""
         with self._lock:
             self._origin_s, self._sighting = origin_s, None
 
     def forget(self) -> None:
-        """Forget the person's rest: another camera, or another person."""
+        """Forget the person's rest, for another camera or another person."""
         with self._lock:
             self._rest = RestingFace()
 
     def put(self, time_s: float, motion: Floats, place_m: Floats | None = None) -> None:
-        """Take a face (58,) of `time_s` of `time.monotonic`, in order of time; `place_m`: see `Sighting`."""
+        """Add a face (58,) seen at `time_s` of `time.monotonic`, in order of time; `place_m`: see `Sighting`."""
         with self._lock:
             self._waiting.append((time_s, motion, place_m))
 
     def at(self, time_s: float) -> Sighting | None:
-        """Return as `ports.Sight.at`."""
+        """Return the newest sighting; see `ports.Sight.at`."""
         with self._lock:
             seen = []
             while self._waiting and self._waiting[0][0] - self._origin_s <= time_s:
@@ -160,7 +160,7 @@ class LiveFace(SourcePart):
                 motion = newest.copy()
                 motion[BLINKS] = np.max([each[BLINKS] for _, each, _ in seen], axis=0)
                 motion[POSE] *= self._signs
-                # Learned in monotonic time: a start does not tear it apart.
+                # The rest is learned in monotonic time, so that a new loop time 0 does not interrupt learning.
                 face = FaceFrame.of(seen_s - self._origin_s, self._rest.relative(motion, seen_s))
                 self._sighting = Sighting(face, place_m=place_m)
             return self._sighting
@@ -168,16 +168,16 @@ class LiveFace(SourcePart):
 
 # --- a person's face at rest, learned while they are seen ---------------------------------------------------------
 #
-# A camera looks from the side or from below, and no face rests at zero. So the pose a person holds most is straight
-# ahead, and a blendshape counts from its resting level on: (v - rest) / (1 - rest).
+# A camera looks from the side or from below, and no face rests at zero. So the pose that a person holds most counts as
+# straight ahead, and a blendshape is measured from its resting level: (v - rest) / (1 - rest).
 #
-# Rest is a quantile of the last two minutes, one sample every half second: the median of pose and gaze, which go both
-# ways, a low quantile of all other shapes, which only go up. From the first face on there is one, of what was seen so
-# far. So:
+# Rest is a quantile of the last two minutes, one sample every half second: the median of pose and gaze, which move both
+# ways, and a low quantile of all other shapes, which only rise. It exists from the first face on, computed from the
+# samples so far. So:
 #
-# - a camera's angle and a face's offset are gone 3 s after the first face, and 80 s after the camera was moved;
-# - what lasts less than half of what is remembered (pose, gaze) or four fifths of it (the others) stays what it is: a
-#   minute once two have been seen;
+# - a camera's angle and a face's offset are removed 3 s after the first face, and 80 s after the camera was moved;
+# - a pose or gaze held for less than half of the remembered time, and another shape held for less than four fifths of
+#   it, does not become rest: for the former that is a minute once two minutes have been seen;
 # - a face that was away for 10 s may come back as another person: learning begins again.
 
 
@@ -191,11 +191,11 @@ class RestingFace:
     def __init__(self) -> None:
         self.samples: Floats = np.zeros((0, MOTION_DIM), dtype=np.float32)
         self._estimate: Floats = NEUTRAL
-        self._rest = self._estimate  # follows it
+        self._rest = self._estimate  # follows the estimate slowly
         self._seen_s = self._sampled_s = -math.inf
 
     def relative(self, motion: Floats, time_s: float) -> Floats:
-        """Return what the person does (58,) in one face (58,) of `time_s`; faces come in order of time.
+        """Return a face (58,) of `time_s` relative to the person's rest, (58,); faces come in order of time.
 
         Shapes stay within 0..1.
         """
@@ -211,7 +211,7 @@ class RestingFace:
         else:
             self._rest = self._estimate
         self._seen_s = time_s
-        # The pose as seen from the resting one, R0^T R, and the shapes above their resting level.
+        # The pose relative to the resting pose, R0^T R, and the shapes above their resting level.
         out, rest = NEUTRAL.copy(), self._rest
         both: Doubles = np.stack([rest[POSE], motion[POSE]]).astype(np.float64)
         at_rest, now = rotation(both[:, :3])
@@ -234,9 +234,9 @@ def _rest(samples: Floats) -> Floats:
 
 # --- a face that arrives as UDP datagrams, of any protocol -----------------------------------------------------------
 #
-# The socket is read without blocking inside `at`, for a bounded time: no thread, and a flood costs the loop 2 ms a call
-# and one packet. Packets that cannot be used are counted, never raised. One sender is used: another is refused until
-# the first has been silent for `SILENT_S`.
+# `at` reads the socket without blocking and for a bounded time: it needs no thread, and a flood of packets costs the
+# loop 2 ms a call plus one packet. Unusable packets are counted and never raise. One sender is used: another is refused
+# until the first has been silent for `SILENT_S`.
 
 Address = tuple[Any, ...]
 
@@ -270,7 +270,7 @@ def _age_s(extra: list[tuple[int, int, bytes]], wall_s: float) -> float:
 
 
 def foreign(data: bytes) -> str | None:
-    """Return the program that sends such a packet, and what to change there; None: not known."""
+    """Return which program sends such a packet and what to change in it; None: unknown."""
     return next((text for pattern, text in _FOREIGN if re.match(pattern, data, re.DOTALL)), None)
 
 
@@ -278,24 +278,24 @@ class Decoder:
     """Reader of the packets of one sender.
 
     Attributes:
-        blind: the sender says that it sees no face.
+        blind: True if the sender reports that it sees no face.
     """
 
     blind = False
 
     def restart(self) -> None:
-        """Forget the last sender: another one begins."""
+        """Forget the last sender before another one begins."""
 
     def decode(self, data: bytes, time_s: float) -> Floats | None:
         """Return motion (58,) of a packet, in the sender's units; None: it has no new face. Raises PacketError."""
         raise NotImplementedError
 
     def due(self, time_s: float) -> Floats | None:
-        """Return motion (58,) that is complete by now, although no packet said so."""
+        """Return motion (58,) that counts as complete by `time_s` although no packet marked its end, or None."""
         return None
 
     def remark(self) -> str | None:
-        """Return what is not used of this sender, in one line."""
+        """Return one line about data of this sender that is not used, or None."""
         return None
 
     def statistics(self) -> Facts:
@@ -305,18 +305,18 @@ class Decoder:
 class UdpSight(LiveFace):
     """`ports.Sight` of `--face KIND[:PORT|HOST[:PORT]][,flip=...]`: one person, seen by another device.
 
-    The time from lens to wire is not known here.
+    The time from the lens to the network is not known here.
 
     Args:
-        hint: returns what a person has to do so that packets come, for the bound host and port, and for the flag that
-            would also take packets of other machines ("" where this one does).
-        units: decide the units of each sender over its first second, which shows no face; None: they are ours.
+        hint: returns what the user has to do so that packets arrive, from the bound host and port and the flag that
+            would also accept packets of other machines ("" if the present flag does).
+        units: decides the units of each sender over its first second, in which no face is shown; None: our units.
 
     Attributes:
         address: host and port that are bound.
-        lost: no face, and no word that there is none, for half a second.
+        lost: True after half a second without a face and without a report that no face is seen.
 
-    Raises ConfigError for an argument that cannot be used and PortError for a port that is taken.
+    Raises ConfigError for an argument that cannot be used and PortError for a port that cannot be bound.
     """
 
     def __init__(
@@ -333,16 +333,16 @@ class UdpSight(LiveFace):
         self._socket = _bound(kind, *parse_endpoint(kind, place))
         self.address: tuple[str, int] = self._socket.getsockname()[:2]
         if sys.platform == "linux":
-            with suppress(OSError):  # a system without stamps: a packet counts from when it is read
+            with suppress(OSError):  # without stamps of the system, a packet counts from when it is read
                 self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         host, port = self.address
         wider = f"--face {kind}:{ANY[0]}" + ("" if port == USUAL_PORTS[kind] else f":{port}")
         self._hint: str | None = hint(host, port, wider if is_loopback(host) else "")
         self._sender: Address | None = None
-        self._before: Address | None = None  # the sender's last port, where it has changed
-        self._other: Address | None = None  # a second program of the sender's machine
+        self._before: Address | None = None  # the sender's address before its port changed
+        self._other: Address | None = None  # a second program on the sender's machine
         self._heard_s = self._result_s = -math.inf
-        self._remark_s = math.inf  # when what is left out of this sender is logged
+        self._remark_s = math.inf  # when to log which data of this sender is not used
         self._said = Said()
         self._refusal_said = False
         self._counts = dict.fromkeys(("packets", "faces", "malformed", "refused", "errors"), 0)
@@ -361,10 +361,10 @@ class UdpSight(LiveFace):
         return super().at(time_s)
 
     def feed(self, data: bytes, sender: Address, time_s: float) -> None:
-        """Take one packet, of any sender, that came in at `time_s` of `time.monotonic`. Never raises."""
+        """Process one packet, of any sender, that arrived at `time_s` of `time.monotonic`. Never raises."""
         self._counts["packets"] += 1
         if self._is_sender(sender):
-            time_s = max(time_s, self._heard_s)  # stamps come from a clock that may be set: time goes forward here
+            time_s = max(time_s, self._heard_s)  # the clock of the stamps may be set back; time here may not
         else:
             if time_s - self._heard_s < SILENT_S:
                 self._refuse(sender)
@@ -391,18 +391,18 @@ class UdpSight(LiveFace):
         self._remark(time_s)
 
     def statistics(self) -> Facts:
-        """Return counts of packets, faces, malformed ones, a second sender's; the sender; what its protocol counts."""
+        """Return counts of packets, faces, malformed and refused packets, errors; the sender; the decoder's counts."""
         sender = None if self._sender is None else address_text(*self._sender[:2])
         return {**self._counts, "sender": sender, **self._decoder.statistics()}
 
     def close(self) -> None:
-        """Give the port back. Idempotent."""
+        """Close the port. Idempotent."""
         self._socket.close()
 
     def _packets(self) -> Iterator[tuple[bytes, Address, float]]:
-        """Yield what has come in as `feed` takes it, oldest first, no more than a call may take.
+        """Yield received packets as arguments of `feed`, oldest first, no more than one call may process.
 
-        Times are those when it came in, where the system says so; else when it was read. Never blocks, never raises.
+        Times are those of arrival if the system reports them, else those of reading. Never blocks, never raises.
         """
         wall_s, now_s = time.time(), time.monotonic()
         for _ in range(PACKETS_PER_CALL):
@@ -415,7 +415,7 @@ class UdpSight(LiveFace):
                     age_s = _age_s(extra, wall_s)
             except BlockingIOError:
                 return
-            except OSError:  # a network that went down: the next call tries again
+            except OSError:  # the network went down: the next call tries again
                 self._counts["errors"] += 1
                 return
             yield data, sender, now_s - age_s
@@ -423,9 +423,9 @@ class UdpSight(LiveFace):
                 return
 
     def _is_sender(self, sender: Address) -> bool:
-        """Return whether this is the sender in use, by its host: some open a new port for each packet.
+        """Return whether this is the sender in use, by its host, because some senders open a new port for each packet.
 
-        A port that comes back after another one is one of two programs; the first is used.
+        If a port is used again after another one, two programs send from the same host; the first one is used.
         """
         if self._sender is None or sender[0] != self._sender[0] or sender == self._other:
             return False
@@ -435,7 +435,7 @@ class UdpSight(LiveFace):
         return True
 
     def _show(self, motion: Floats, time_s: float) -> None:
-        """Show a face (58,) in the sender's units, once these are known."""
+        """Convert a face (58,) from the sender's units, once they are known, and put it."""
         ours: Floats | None = motion
         if self._units is not None:
             ours, units = self._units.take(motion, time_s), self._units.units
@@ -451,7 +451,7 @@ class UdpSight(LiveFace):
             self.put(time_s, ours)
 
     def _remark(self, time_s: float) -> None:
-        """Log what is not used of this sender, some seconds after its first packet."""
+        """Log which data of this sender is not used, some seconds after its first packet."""
         if time_s < self._remark_s:
             return
         self._remark_s = math.inf
@@ -484,7 +484,7 @@ class UdpSight(LiveFace):
 def parse_endpoint(kind: str, place: str) -> tuple[str, int]:
     """Return host and port of PORT, HOST:PORT ([HOST]:PORT for IPv6) or an address alone.
 
-    Loopback and the kind's usual port are what PLACE leaves out. Raises ConfigError.
+    Parts that PLACE leaves out are loopback and the kind's usual port. Raises ConfigError.
     """
     if not place:
         return LOOPBACK, USUAL_PORTS[kind]

@@ -1,17 +1,18 @@
 """Live Link Face, Epic's app for iPhones with a depth camera: `--face live-link[:PORT|:HOST[:PORT]]`.
 
-One packet a frame, big-endian:
+Each frame is one packet, big-endian:
 
-    uint8   version, 6; another one is read where the rest is as here
+    uint8   version, 6; another version is accepted if the rest has this format
     int32   length n, then n bytes: device id          (n < 0: -n characters of UTF-16)
     int32   length n, then n bytes: subject name; some senders count characters, not bytes
     int32   frame number, counted from midnight; float32 part of a frame
-    int32   frame rate: numerator, denominator; 30/0 and the like of senders below 60 a second are 30
-    uint8   number of values: 61, or 0 while no face is seen; 52 have no head, of more than 61 the first are read
+    int32   frame rate: numerator, denominator; 30/0 and similar values of senders below 60 a second mean 30
+    uint8   number of values: 61, or 0 while no face is seen; 52 lack the head, of more than 61 the first are read
     float32 52 blendshapes in the order "live_link_udp"; head yaw, pitch, roll; yaw, pitch, roll of each eye [rad]
 
-The head's angles turn as ours do, which is not proved (`signals.tracks`). Some senders write them in degrees, which is
-decided over the first second (`signals.face_units`). Only what a face needs is judged: 52 blendshapes, three angles.
+The head's angles have the same signs as ours, which is not proved (`signals.tracks`). Some senders write them in
+degrees, which is decided over the first second (`signals.face_units`). Only values that a face needs are checked: 52
+blendshapes and three angles.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from sfms_robot.signals.face_units import LiveUnits
 from sfms_robot.sources.live_face import ANY, Decoder, UdpSight, foreign
 
 VERSION: Final = 6
-LATE_S: Final = 0.5  # a frame number further back than this, or after so long a silence: the count began again
+LATE_S: Final = 0.5  # a frame number further back than this, or after a longer silence, begins a new count
 
 _LENGTH: Final = struct.Struct(">i")
 _FRAME: Final = struct.Struct(">ifiiB")
@@ -39,7 +40,7 @@ _USUAL_HZ: Final = 60.0
 _SHAPES: Final = ORDERS["live_link_udp"]
 _VALUES: Final = (*_SHAPES, "yaw", "pitch", "roll", *(f"eye{i}" for i in range(6)))
 _NEEDED: Final = _VALUES.index("eye0")
-# Of each of our channels: where it stands in a packet, and its factor; a packet has no position.
+# For each of our channels: its index in a packet, and its factor, 0 for channels that a packet lacks (position).
 _COLUMNS: Final = np.array([_VALUES.index(name) if name in _VALUES else 0 for name in CHANNELS])
 _FACTORS: Final = np.array([name in _VALUES for name in CHANNELS], dtype=np.float32)
 
@@ -48,8 +49,8 @@ class LiveLinkPacket(NamedTuple):
     """One packet.
 
     Attributes:
-        number: of the frame; what it counts is frames of `rate_hz` since midnight, or anything.
-        values: (61,) as the phone sent them, 0 for those that are missing, or None: no face is seen.
+        number: frame number; it counts frames of `rate_hz` since midnight, or from any other start.
+        values: (61,) as the phone sent them, 0 for missing ones; None: no face is seen.
         sent: number of values in the packet.
     """
 
@@ -61,7 +62,7 @@ class LiveLinkPacket(NamedTuple):
 
 
 def parse_packet(data: bytes) -> LiveLinkPacket:
-    """Return a packet that has what a face needs. Raises PacketError, in one line, for any other."""
+    """Parse a packet with the values that a face needs. Raises PacketError, in one line, for any other packet."""
     if not data:
         raise PacketError("an empty packet")
     try:
@@ -96,20 +97,20 @@ def _values(data: bytes, start: int, count: int) -> Floats:
 
 
 def _ends(data: bytes, start: int) -> Iterator[int]:
-    """Yield where a name may end: at its length in bytes, or with more bytes to a character."""
+    """Yield possible ends of a name: at its length in bytes, then later ones, for a length in characters."""
     (length,) = _LENGTH.unpack_from(data, start)
     begin = start + _LENGTH.size
     yield from range(begin + (length if length >= 0 else -2 * length), begin + 4 * abs(length) + 1)
 
 
 def _fits(data: bytes, at: int) -> bool:
-    """Return whether a frame that begins here fills the rest of the packet."""
+    """Return whether a frame that begins at `at` fills the rest of the packet."""
     values = at + _FRAME.size
     return values <= len(data) == values + 4 * data[values - 1]
 
 
 def _end_of_name(data: bytes, start: int) -> int:
-    """Return where a text ends by its own length, which is at `start`."""
+    """Return the end of a text according to its length, which is stored at `start`."""
     if len(data) < start + _LENGTH.size:
         raise PacketError("a packet that is cut off")
     (length,) = _LENGTH.unpack_from(data, start)
@@ -121,13 +122,13 @@ def _end_of_name(data: bytes, start: int) -> int:
 
 
 def _text(data: bytes, start: int, end: int) -> str:
-    """Return the text whose length begins at `start`."""
+    """Return the text whose length is stored at `start`."""
     wide = data[start] > 0x7F  # a negative length
     return data[start + _LENGTH.size : end].decode("utf-16-be" if wide else "utf-8", "replace").rstrip("\0")
 
 
 def _other_format(data: bytes) -> str | None:
-    """Return which other format this is; None: Live Link's."""
+    """Return a line about the other format that this is; None: it is Live Link's."""
     if any(_is_animator(data, order) for order in "<>"):
         return (
             "the app is in MetaHuman Animator mode, which sends no blendshapes: choose Live Link (ARKit) as its "
@@ -139,7 +140,7 @@ def _other_format(data: bytes) -> str | None:
 
 
 def _is_animator(data: bytes, order: str) -> bool:
-    """Return whether it is uint16 version, text, frame time, uint16 values, 6 floats of pose: by its exact length."""
+    """Return whether data is uint16 version, text, frame time, uint16 values, 6 floats of pose, by its exact length."""
     head = struct.Struct(order + "HH")
     if len(data) < head.size:
         return False
@@ -152,17 +153,17 @@ def _is_animator(data: bytes, order: str) -> bool:
 
 
 def motion_of(values: Floats) -> Floats:
-    """Return motion (58,) of the values (61,) of a packet, in its units; it has no position, which stays 0."""
+    """Return motion (58,) of the values (61,) of a packet, in the packet's units; the position is 0."""
     motion: Floats = values[_COLUMNS] * _FACTORS
     return motion
 
 
 class LiveLinkDecoder(Decoder):
-    """`Decoder` of one phone: the order of its packets is judged by their frame numbers.
+    """`Decoder` of one phone, which determines the order of its packets from their frame numbers.
 
-    A number a little back is late, one far back a new count: midnight, or the app was started again. Phones count in
-    steps of one, or of two where they send every other frame: lost is what is missing between steps. Of a sender that
-    has never counted, each packet is a new frame.
+    A number that is a little lower is a late packet; one that is much lower begins a new count, at midnight or after a
+    restart of the app. Phones count in steps of one, or of two if they send every other frame; numbers missing between
+    steps are lost packets. If a sender has never counted, each packet is a new frame.
     """
 
     def __init__(self) -> None:
@@ -197,7 +198,7 @@ class LiveLinkDecoder(Decoder):
         return f"{self._sent} values, not {len(_VALUES)}: {unused}"
 
     def statistics(self) -> Facts:
-        """Return counts of frames lost, doubled, late, without a face, of new counts of the phone; and its name."""
+        """Return counts of lost, doubled, late and faceless frames, and of restarts of the count; and the subject."""
         return {**self._counts, "subject": self._subject}
 
     def _is_next(self, packet: LiveLinkPacket, data: bytes, time_s: float) -> bool:
@@ -222,14 +223,14 @@ class LiveLinkDecoder(Decoder):
 def open_live_link(argument: str) -> UdpSight:
     """Open `--face live-link[:PORT|HOST[:PORT]][,flip=...]`; without HOST only this machine can send.
 
-    The log says what to type for a phone, which is another machine, and the address for its app. Raises as
+    The log contains the flag for a phone, which is another machine, and the address to enter in its app. Raises as
     `UdpSight`.
     """
     return UdpSight("live-link", argument, LiveLinkDecoder(), _hint, LiveUnits())
 
 
 def _hint(host: str, port: int, wider: str) -> str:
-    """Return what to do so that packets of a phone arrive."""
+    """Return instructions for making packets of a phone arrive."""
     own = addresses_of_this_machine() if wider or host in ANY else [host]
     target = f"{' or '.join(own) or 'the address of this machine'}, port {port}"
     app = f"in the app, capture mode Live Link (ARKit), enter the target {target}"

@@ -1,17 +1,17 @@
-"""A live voice on the grid of the loop: pieces of a sound card, or of a sender, in; frames of 640 samples out.
+"""A live voice on the grid of the loop: converts pieces from a sound card or a sender to frames of 640 samples.
 
 Sound cards drift: 100 ppm are 0.36 s an hour. So each piece comes with the time of its newest sample, `SampleClock`
-computes from them where every sample lies, and a resampler of variable rate (soxr) follows: its ratio is the card's
-true rate, and a little more or less where its output is ahead or behind, 1 % at most. Nothing is cut out or put in but
-for three cases:
+computes from these times where every sample lies, and a resampler of variable rate (soxr) follows. Its ratio is that of
+the card's true rate, changed by at most 1 % when its output is ahead or behind. Samples are cut out or inserted in
+three cases only:
 
-1. The device was away: `GAP_S` and more are missing. The frames of that time are missing too, and the stretch after it
-   is placed again.
-2. A stretch of less than `SETTLE_S`, of which little is known yet, is placed again where it is `UNSETTLED_S` off.
-3. The place is off by more than `GAP_S`: pieces that were held up came all at once.
+1. The device was away: `GAP_S` or more are missing. The frames of that time are missing too, and the stretch of samples
+   after the gap is placed on the grid again.
+2. A stretch of less than `SETTLE_S`, of which little is known yet, is placed again when it is off by `UNSETTLED_S`.
+3. The place is off by more than `GAP_S`: pieces that were held up arrived all at once.
 
 soxr 1.0, which some packages pin, has no variable rate: a stream keeps the true rate known when it was placed, and is
-placed again where it is `UNSETTLED_S` off.
+placed again when it is off by `UNSETTLED_S`.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ GAP_S: Final = 0.15
 SETTLE_S: Final = 1.0
 UNSETTLED_S: Final = 0.01
 PULL_S: Final = 1.0  # time constant of a correction
-LARGEST_PULL: Final = 0.01  # of the rate: a sixth of a semitone
-KEPT_FRAMES: Final = 50  # at most, ahead of the one that is asked for
-_LATENCY_FALLS_S: Final = 1e-4  # a frame, so that a bad second is forgotten in a minute
+LARGEST_PULL: Final = 0.01  # largest correction, as a share of the rate: a sixth of a semitone
+KEPT_FRAMES: Final = 50  # most frames kept ahead of the requested one
+_LATENCY_FALLS_S: Final = 1e-4  # decrease per frame, so that a bad second is forgotten in a minute
 
-BIN_S: Final = 1.0  # the least late callback of every second is kept
-BINS: Final = 64  # so the line follows a card that warms up within a minute
-LEAST_SPAN_S: Final = 8.0  # of fewer seconds jitter would say more of the rate than the card does
-LOST_S: Final = 0.02  # when the least late of a whole second is this late, samples were lost
-LARGEST_SKEW: Final = 5e-3  # more is another rate than the one that was said
+BIN_S: Final = 1.0  # of each bin of this length, the least late callback is kept
+BINS: Final = 64  # about a minute, so that the line follows a card that warms up
+LEAST_SPAN_S: Final = 8.0  # over a shorter span, jitter would affect the estimated rate more than the card does
+LOST_S: Final = 0.02  # if the least late callback of a bin is this late, samples were lost
+LARGEST_SKEW: Final = 5e-3  # a larger skew means that the nominal rate is wrong
 
 
 Clock = Callable[[], float]  # in seconds
 
 
 class SourcePart:
-    """Common parts of voices and sights (`ports.Voice`, `ports.Sight`), with defaults.
+    """Base class of voices and sights (`ports.Voice`, `ports.Sight`), with defaults.
 
-    now: `time.monotonic`, or a test's clock.
+    now: `time.monotonic`, or the clock of a test.
     """
 
     lost = False
@@ -74,11 +74,11 @@ class SourcePart:
         return {}
 
     def close(self) -> None:
-        """Give back what is open. Idempotent."""
+        """Close all resources. Idempotent."""
 
 
 def window(first: int, samples: Floats, begin: int) -> Floats:
-    """Return the (640,) from place `begin` on, of `samples` that begin at place `first`; silence elsewhere."""
+    """Return 640 samples from place `begin` on, cut from `samples`, which begin at place `first`; silence elsewhere."""
     out = SILENCE.copy()
     start, end = max(first, begin), min(first + len(samples), begin + FRAME_SAMPLES)
     if start < end:
@@ -89,20 +89,22 @@ def window(first: int, samples: Floats, begin: int) -> Floats:
 # --- the clock of a sound card, measured by the computer's -----------------------------------------------------------
 #
 # The card counts samples; each callback comes with the time of its newest sample, by the computer's clock. A callback
-# may come late, never early. So in the plane of (samples, seconds) the truth is a line under all callbacks, as high as
-# possible: the edge of their lower convex hull below the middle of them, which leaves the least lateness in all (Moon,
-# Skelly and Towsley, "Estimation and removal of clock skew from network delay measurements", 1999). One late callback,
-# or many, lie above it and change nothing.
+# may come late, never early. So in the plane of (samples, seconds) the true clock is the highest line below all
+# callbacks: the edge of their lower convex hull below their middle, which makes the sum of lateness least (Moon, Skelly
+# and Towsley, "Estimation and removal of clock skew from network delay measurements", 1999). Late callbacks, one or
+# many, lie above the line and do not change it.
 
 _Point = tuple[float, float]
 
 
 class SampleClock:
-    """Samples of one unbroken stream <-> seconds of `time.monotonic`. Counts begin at 0; not thread-safe.
+    """Conversion between samples of one unbroken stream and seconds of `time.monotonic`.
+
+    Counts begin at 0. Not thread-safe.
 
     Args:
-        rate_hz: nominal.
-        skew: where it is known: seconds of the computer for one of the card, less one.
+        rate_hz: nominal rate.
+        skew: seconds of the computer for one second of the card, minus one, if known.
     """
 
     def __init__(self, rate_hz: float, skew: float = 0.0) -> None:
@@ -120,11 +122,11 @@ class SampleClock:
 
     @property
     def drift_ppm(self) -> float:
-        """Excess of the card's rate over its nominal one [ppm]."""
+        """Excess of the card's rate over its nominal rate [ppm]."""
         return (1.0 / (1.0 + self.skew) - 1.0) * 1e6
 
     def observe(self, count: int, captured_s: float) -> None:
-        """Take in a callback: `count` samples so far, the newest of them at `captured_s` or before."""
+        """Update the line by a callback: `count` samples so far, the newest captured at `captured_s` or before."""
         x_s = count / self._nominal_hz
         point = (x_s, float(captured_s) - x_s)
         below_s = point[1] - self.skew * x_s
@@ -143,22 +145,22 @@ class SampleClock:
         self._offset_s = min(r - self.skew * x for x, r in self._least)
 
     def lateness_s(self, count: int, captured_s: float) -> float:
-        """Return how late such a callback would be; below 0: earlier than the line allows. 0 for the first."""
+        """Return how late such a callback would be; negative: earlier than the line allows. 0 for the first one."""
         return 0.0 if self._offset_s is None else captured_s - self.time_s(count)
 
     def time_s(self, count: float) -> float:
-        """Return when so many samples had been captured. Raises ValueError before the first callback."""
+        """Return when `count` samples had been captured. Raises ValueError before the first callback."""
         if self._offset_s is None:
             raise ValueError("no callback was observed")
         return self._offset_s + (1.0 + self.skew) * count / self._nominal_hz
 
     def count_at(self, time_s: float) -> float:
-        """Return how many samples had been captured then."""
+        """Return how many samples had been captured at `time_s`."""
         return (time_s - self.time_s(0)) * self.rate_hz
 
 
 def _edge_below_middle(points: list[_Point]) -> tuple[_Point, _Point]:
-    """Return that edge of the lower convex hull of two or more points, which go from left to right."""
+    """Return the edge of the lower convex hull below the middle of two or more points, sorted from left to right."""
     hull: list[_Point] = []
     for point in points:
         while len(hull) > 1 and _turns_right(hull[-2], hull[-1], point):
@@ -173,36 +175,36 @@ def _turns_right(a: _Point, b: _Point, c: _Point) -> bool:
     return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])
 
 
-# --- the pace at which sound is handed over --------------------------------------------------------------------------
+# --- the pace at which sound is delivered ----------------------------------------------------------------------------
 
-PAUSE_S: Final = 0.25  # a longer wait than its piece by so much: nothing was said meanwhile
-OFF_PACE: Final = 0.015  # a sound card is off by a third of it at most
+PAUSE_S: Final = 0.25  # a wait that is this much longer than its piece is a pause of the sender
+OFF_PACE: Final = 0.015  # a sound card is off by at most a third of this
 PACE_SECONDS: Final = 6
 BURSTS: Final = 5  # within `BURSTS_S`
 BURSTS_S: Final = 10.0
 
 
 class Pace:
-    """The pace at which a source hands over sound, against time: too slow, too fast, or in bursts.
+    """Meter of the pace at which a source delivers sound, relative to time: too slow, too fast, or in bursts.
 
-    A source is behind by the time that has passed, less the sound that came. That goes up and down with its pieces; but
-    the least of each second stays where it is for a source that keeps pace. The median of its changes is the pace.
+    A source is behind by the time that has passed minus the sound that came. This lag rises and falls with the pieces,
+    but its minimum in each second is constant for a source that keeps pace. The median of its changes gives the pace.
 
     Attributes:
-        rate: seconds of sound a second, over the last seconds; None: not known yet.
+        rate: seconds of sound per second, over the last seconds; None: not known yet.
     """
 
     def __init__(self) -> None:
         self.rate: float | None = None
         self._last_s = -math.inf
         self._behind_s = self._most_s = 0.0
-        self._least = deque[_Point](maxlen=PACE_SECONDS + 1)  # (begin of a second, least), the last so far
-        self._wait_s = self._widest_s = 0.0  # longest since the last burst, and before any
+        self._least = deque[_Point](maxlen=PACE_SECONDS + 1)  # (begin of a second, least lag), the last unfinished
+        self._wait_s = self._widest_s = 0.0  # longest wait since the last burst, and longest before any burst
         self._bursts_s = deque[float](maxlen=BURSTS)
         self._said = False
 
     def observe(self, piece_s: float, now_s: float) -> None:
-        """Take in a piece that is handed over at `now_s`."""
+        """Update the pace by a piece of `piece_s` that is delivered at `now_s`."""
         wait_s, self._last_s = now_s - self._last_s, now_s
         if math.isinf(wait_s):
             wait_s = piece_s
@@ -221,7 +223,7 @@ class Pace:
 
     @property
     def problem(self) -> str | None:
-        """A fault of the pace, in one line, or None."""
+        """One line about a fault of the pace, or None."""
         if self.off:
             way = "falls behind" if self.off < 1.0 else "is ahead"
             return f"sound comes at {self.off:.2f} of real time: its sender {way}; pace it by the clock"
@@ -230,19 +232,19 @@ class Pace:
         return None
 
     def warn_once(self, name: str) -> None:
-        """Log what is wrong with the pace of the source of that name, the first time."""
+        """Log the fault of the pace of the source `name`, the first time that there is one."""
         if not self._said and (problem := self.problem) is not None:
             self._said = True
             logger.warning("%s: %s (said once)", name, problem)
 
     @property
     def off(self) -> float | None:
-        """Return the rate where it is not that of time, else None."""
+        """Return the rate if it differs from real time, else None."""
         return None if self.rate is None or abs(self.rate - 1.0) <= OFF_PACE else self.rate
 
     @property
     def apart_s(self) -> float:
-        """Longest wait between two bursts, where sound comes in bursts, else 0."""
+        """Longest wait between two bursts if sound comes in bursts, else 0."""
         bursts = len(self._bursts_s) == BURSTS and self._last_s - self._bursts_s[0] < BURSTS_S
         return self._widest_s if bursts else 0.0
 
@@ -255,11 +257,12 @@ class Pace:
 
 
 class LiveVoice(SourcePart):
-    """`ports.Voice` of a live stream. All methods may be called from any thread; none blocks for longer than a piece
-    takes to be resampled.
+    """A `ports.Voice` of a live stream.
+
+    All methods may be called from any thread; none blocks for longer than the resampling of a piece takes.
 
     Attributes:
-        mix: of its channels; `name` is that of the sound in its line.
+        mix: mix of its channels; `name` is the name of the sound in the mix's log line.
     """
 
     def __init__(self, now: Clock = time.monotonic, name: str = "sound") -> None:
@@ -268,33 +271,33 @@ class LiveVoice(SourcePart):
         self.mix = Downmix(name)
         self._rate_hz = 0.0
         self._clock: SampleClock | None = None  # None: the next piece begins a stretch
-        self._skew = 0.0  # of the card, kept over its gaps
-        self._received = 0  # samples of the stretch
-        self._settled_s = 0.0  # when enough is known of the stretch
+        self._skew = 0.0  # skew of the card, kept over its gaps
+        self._received = 0  # samples received of the stretch
+        self._settled_s = 0.0  # time from which enough is known of the stretch
         self._stream: Any = None  # None: the next piece is placed
-        self._ratio = 1.0  # samples of the card to one of the loop
-        self._varies = True  # soxr follows the ratio, from 1.1 on
-        self._position = 0.0  # samples of the stretch that went into what came out of the stream
-        self._next = 0  # sample of the loop, at 16 kHz, that the stream gives next
+        self._ratio = 1.0  # samples of the card per sample of the loop
+        self._varies = True  # soxr has a variable ratio, from version 1.1 on
+        self._position = 0.0  # samples of the stretch that correspond to the output of the stream so far
+        self._next = 0  # sample of the loop, at 16 kHz, that the stream returns next
         self._frames: dict[int, Floats] = {}
-        self._wanted = 0  # frame
+        self._wanted = 0  # index of the frame requested last
         self._counts = {"gaps": 0, "late_samples": 0, "not_finite": 0}
-        self._uneven_s = 0.0  # by which pieces come late without being missing
+        self._uneven_s = 0.0  # additional lateness that does not count as a gap
 
     def start(self, origin_s: float) -> None:
-        """Set loop time 0 to `origin_s` of `time.monotonic`. Earlier pieces are dropped, but taught the clock."""
+        """Set loop time 0 to `origin_s` of `time.monotonic`. Earlier pieces are dropped after use by the clock."""
         with self._lock:
             self._zero_s, self._stream, self._next, self._wanted = origin_s, None, 0, 0
             self._frames.clear()
 
     def push(self, samples: Floats, rate_hz: float, captured_s: float, arrived_s: float | None = None) -> None:
-        """Take the next piece, (n,) or (n, channels), full scale 1.
+        """Add the next piece, (n,) or (n, channels), full scale 1.
 
         Args:
             captured_s: `time.monotonic` of its newest sample; may be late by some tens of milliseconds, never early.
-            arrived_s: when it is pushed, for the latency, where that is another time.
+            arrived_s: time of the push, for the latency, if it differs from `captured_s`.
 
-        What is not finite counts as silence. Raises ConfigError for a rate outside 4 to 384 kHz.
+        Samples that are not finite count as silence. Raises ConfigError for a rate outside 4 to 384 kHz.
         """
         check_rate(rate_hz)
         samples, not_finite = finite(samples)
@@ -308,7 +311,7 @@ class LiveVoice(SourcePart):
                 self._resample(mono, captured_s, captured_s if arrived_s is None else arrived_s)
 
     def take(self, index: int) -> Floats | None:
-        """Return a frame as `ports.Voice`. A frame of which only a part was heard is filled up with silence."""
+        """Return a frame; see `ports.Voice`. A frame of which only a part arrived is filled up with silence."""
         with self._lock:
             self._wanted = index
             for old in [each for each in self._frames if each < index]:
@@ -317,7 +320,7 @@ class LiveVoice(SourcePart):
             return self._frames.pop(index, None) if whole else None
 
     def statistics(self) -> Facts:
-        """Return drift of the card, gaps, samples that came too late or were not finite, and the latency."""
+        """Return rate and drift of the card, latency, gaps, and samples that came too late or were not finite."""
         with self._lock:
             drift_ppm = None if self._clock is None else round(self._clock.drift_ppm, 1)
             return {
@@ -326,12 +329,12 @@ class LiveVoice(SourcePart):
             }  # fmt: skip
 
     def interrupt(self) -> None:
-        """Let the next piece not follow the last one."""
+        """End the stretch, so that the next piece does not follow the last one."""
         with self._lock:
             self._end_stretch()
 
     def _observe(self, n: int, rate_hz: float, captured_s: float) -> None:
-        """Learn from a piece; it begins a stretch when it cannot follow the last one."""
+        """Update the clock by a piece; a piece that cannot follow the last one begins a new stretch."""
         if rate_hz != self._rate_hz:
             self._end_stretch()
         elif (
@@ -366,12 +369,12 @@ class LiveVoice(SourcePart):
         self._write(out, arrived_s)
 
     def _behind(self) -> float:
-        """Return by how many samples of the card the stream is behind its place."""
+        """Return how many samples of the card the stream is behind its place."""
         assert self._clock is not None and self._zero_s is not None
         return self._clock.count_at(self._zero_s + self._next / AUDIO_HZ) - self._position
 
     def _place(self, samples: Floats, first: int) -> Floats:
-        """Begin a stream at the first of these samples that is not in the past; return the rest of them."""
+        """Begin a stream at the first of these samples that is not in the past; return the samples from there on."""
         import soxr
 
         assert self._clock is not None and self._zero_s is not None
@@ -398,7 +401,7 @@ class LiveVoice(SourcePart):
             self._stream = None
 
     def _write(self, samples: Floats, arrived_s: float | None) -> None:
-        """Put samples into their frames. `arrived_s`: None for what a resampler still held."""
+        """Put samples into their frames. `arrived_s`: None for samples that a resampler still held."""
         while len(samples):
             index, within = divmod(self._next, FRAME_SAMPLES)
             part, samples = samples[: FRAME_SAMPLES - within], samples[FRAME_SAMPLES - within :]
@@ -415,11 +418,11 @@ class LiveVoice(SourcePart):
 
 
 def latency_after(late_s: float, latency_s: float) -> float:
-    """Return the latency after a frame that came `late_s`: never less, and falling slowly."""
+    """Return the latency after a frame that came `late_s` after its end: at least that, and falling slowly."""
     return max(late_s, latency_s - _LATENCY_FALLS_S, 0.0)
 
 
 def check_rate(rate_hz: float) -> None:
-    """Raise ConfigError for a rate that speech does not have, and for one that is not a number."""
+    """Raise ConfigError for a sample rate that is not one of speech, or is not a number."""
     if not isinstance(rate_hz, Real) or not LOWEST_RATE_HZ <= rate_hz <= HIGHEST_RATE_HZ:
         raise ConfigError(f"rate_hz = {rate_hz!r}: expected a rate of speech ({LOWEST_RATE_HZ} to {HIGHEST_RATE_HZ})")

@@ -1,8 +1,8 @@
-"""The microphone: `--audio mic[:DEVICE]`, and what the robot says into it: `--agent-audio device:DEVICE`.
+"""The microphone, `--audio mic[:DEVICE]`, and the robot's voice as a device records it, `--agent-audio device:DEVICE`.
 
-PortAudio, resampling and echo cancellation are in a process of their own (`listen`), which sends frames of the loop. A
-device that gives nothing for a fifth of a second went away: the process ends, and the next one begins with a PortAudio
-that sees the devices of that moment, until the device is back.
+PortAudio, resampling and echo cancellation run in a separate process (`listen`), which sends frames of the loop. A
+device without sound for a fifth of a second is lost: the process ends and is started again, with a PortAudio that lists
+the devices of that moment, until the device is back.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ logger = logging.getLogger(__name__)
 MIC_FLAG: Final = "--audio mic"
 DEVICE_FLAG: Final = "--agent-audio device"
 STATISTICS_S: Final = 1.0
-LINES: Final = "lines"  # key of the statistics: what the run logs of the device, as its process has no log
-LONGEST_WAIT_S: Final = 0.15  # for the microphone, from the end of a frame: later it is of no use to the loop
+LINES: Final = "lines"  # key in the statistics: lines for the run to log, because the worker has no log
+LONGEST_WAIT_S: Final = 0.15  # longest wait for the microphone from the end of a frame; later the loop cannot use it
 REFERENCE_WAIT_S: Final = 0.1
-SAID_FRAMES: Final = 12  # of the robot's voice in a message: the worker may miss half a second of messages
+SAID_FRAMES: Final = 12  # frames of the robot's voice in a message: the worker may miss half a second of messages
 KEPT_FRAMES: Final = 50
 _ALIVE_S: Final = 0.1
-_NEW_SPEED_RAD_S: Final = 0.1  # a change of speed that is worth a message
+_NEW_SPEED_RAD_S: Final = 0.1  # least change of speed that is sent
 
 
 # --- the worker's side -----------------------------------------------------------------------------------------------
@@ -47,12 +47,12 @@ _NEW_SPEED_RAD_S: Final = 0.1  # a change of speed that is worth a message
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """A device to record: by number, name or part of its name, "" for the default one.
+    """A device to record: its number, name or part of its name; "" for the default device.
 
     Attributes:
-        flag: the option in errors, "--audio mic".
-        reference: device that records what the loudspeaker is given; None: none.
-        spoken: the parent sends what the robot says (`ToWorker.said`).
+        flag: the option named in errors, "--audio mic".
+        reference: device that records the signal of the loudspeaker, or None.
+        spoken: True if the parent sends the robot's voice (`ToWorker.said`).
     """
 
     device: str
@@ -63,12 +63,12 @@ class Recording:
 
 @dataclass(frozen=True)
 class ToWorker:
-    """From the parent.
+    """A message from the parent.
 
     Attributes:
         origin_s: loop time 0 in seconds of `time.monotonic`.
-        first, said: (n x 640,) what the robot says from frame `first` on: the newest frames, as it may miss some.
-        speed_rad_s: how fast its joints move, all together.
+        first, said: (n x 640,) the robot's voice from frame `first` on; several frames, because messages may be missed.
+        speed_rad_s: summed speed of the head's joints.
     """
 
     origin_s: float
@@ -82,10 +82,10 @@ class MicrophoneFrame:
     """A frame of the loop.
 
     Attributes:
-        index: of the frame.
-        known_s: when it was known, `time.monotonic`.
-        audio: (640,) what the person said.
-        said: (640,) what the robot said meanwhile, where a device records it; as late as `audio`.
+        index: index of the frame.
+        known_s: time of `time.monotonic` at which it was known.
+        audio: (640,) the person's voice.
+        said: (640,) the robot's voice at the same time if a device records it, else None; as late as `audio`.
     """
 
     index: int
@@ -98,10 +98,10 @@ MicrophoneMessage = str | MicrophoneFrame | Report  # the first is the name of t
 
 
 def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker | None, None]:
-    """Yield frames of a microphone, once a second its statistics; see `sources.worker`.
+    """Yield frames of a microphone, and once a second its statistics; see `sources.worker`.
 
-    Raises ConfigError for a device that is not there and without PortAudio, PortError where nothing records, for a
-    device that cannot be opened, and when one goes away.
+    Raises ConfigError for an unknown device or if PortAudio is missing; PortError if no device records, or if a device
+    cannot be opened or is lost.
     """
     with ExitStack() as stack:
         mic = stack.enter_context(closing(Capture.opened(recording.device, recording.flag)))
@@ -131,35 +131,35 @@ def listen(recording: Recording) -> Generator[MicrophoneMessage | None, ToWorker
                 pace = None if mic.pace.rate is None else round(mic.pace.rate, 3)
                 messages.append({**front_end.statistics(), "overflows": mic.overflows, "pace": pace, LINES: lines})
             elif not messages and (before is None or recording.spoken or now_s > said_s + _ALIVE_S):
-                messages.append(None)  # and receive what the parent sends
+                messages.append(None)  # yield, to receive messages of the parent
             for message in messages:
                 given, said_s = (yield message), now_s
 
 
-# --- from what is recorded to what a person said, on the grid of the loop -----------------------------------------
+# --- from recorded sound to a person's voice, on the grid of the loop ---------------------------------------------
 #
-#     pieces by their time stamps -> frames of 40 ms -> what the robot itself says taken out -> `MicrophoneFrame`
+#     pieces by their time stamps -> frames of 40 ms -> the robot's own voice removed -> `MicrophoneFrame`
 #
-# Microphone and reference each drift by their own clock; both are resampled to the computer's (`LiveVoice`), so that
-# they stay together. The echo canceller is a few milliseconds late: its frames begin that much later, so that its
-# output is the frames of the loop, and nothing waits for the next one.
+# Microphone and reference drift, each with its own clock; both are resampled to the computer's clock (`LiveVoice`), so
+# that they stay together. The echo canceller is a few milliseconds late. Its input frames begin that much later, so
+# that its output is on the frames of the loop, and no frame waits for the next one.
 
 
 class SpeechFrames:
-    """Speech of the robot, in frames of the loop, known one frame before they are played."""
+    """Speech of the robot in frames of the loop, each known one frame before it is played."""
 
     _first = 0  # sample of the loop
     _samples: Floats = SILENCE[:0]
 
     def start(self, origin_s: float) -> None:
-        """Do nothing: they are counted from the origin already."""
+        """Do nothing: the frames are counted from loop time 0 already."""
 
     def set(self, first: int, samples: Floats) -> None:
-        """Set (n x 640,) from frame `first` on, instead of those before."""
+        """Set the samples (n x 640,) from frame `first` on, which replace the earlier ones."""
         self._first, self._samples = first * FRAME_SAMPLES, samples
 
     def take(self, index: int) -> Floats | None:
-        """Return (640,) of a frame of the echo canceller, which is that much later; None: not known yet."""
+        """Return the samples (640,) of a frame, shifted by the latency of the echo canceller; None: not known yet."""
         begin = index * FRAME_SAMPLES + ECHO_LATENCY_SAMPLES - self._first
         if begin + FRAME_SAMPLES > len(self._samples):
             return None
@@ -167,15 +167,15 @@ class SpeechFrames:
 
 
 class FrontEnd:
-    """One microphone and, where the robot speaks, its voice. Belongs to one thread.
+    """Processing of one microphone and, if the robot speaks, of its voice. Belongs to one thread.
 
     Args:
-        reference: what the robot says: a `LiveVoice` of what its loudspeaker is given, or frames from the parent.
-        name: of the device, in log lines.
+        reference: the robot's voice: a `LiveVoice` of the signal of its loudspeaker, or frames from the parent.
+        name: name of the device in log lines.
 
     Attributes:
-        mic: push its pieces here.
-        speed_rad_s: how fast the head's joints move, all together, by which the noise of their motors is judged.
+        mic: voice that receives the microphone's pieces by `push`.
+        speed_rad_s: summed speed of the head's joints, which determines the expected noise of their motors.
     """
 
     def __init__(self, reference: LiveVoice | SpeechFrames | None = None, name: str = "microphone") -> None:
@@ -185,11 +185,11 @@ class FrontEnd:
         self._gate = OwnVoiceGate(speaks=reference is not None)
         self._origin_s: float | None = None
         self._next = 0
-        self._waiting: Floats | None = None  # of the microphone, for its reference
+        self._waiting: Floats | None = None  # frame of the microphone that waits for its reference
         self._counts = {"voice_frames": 0, "own_voice_frames": 0, "without_reference": 0}
 
     def start(self, origin_s: float, now_s: float) -> None:
-        """Set loop time 0 to `origin_s` of `time.monotonic`; frames that ended before `now_s` are not given."""
+        """Set loop time 0 to `origin_s` of `time.monotonic`; frames that ended before `now_s` are skipped."""
         begins_s = origin_s + self._gate.latency_s
         self.mic.start(begins_s)
         if self._reference is not None:
@@ -198,7 +198,7 @@ class FrontEnd:
         self._next = max(0, math.floor((now_s - origin_s) * FRAME_HZ))
 
     def frames(self, now_s: float) -> list[MicrophoneFrame]:
-        """Return frames that are whole, oldest first; one whose microphone is missing for too long is left out."""
+        """Return complete frames, oldest first; a frame whose microphone sound is too late is left out."""
         frames: list[MicrophoneFrame] = []
         while self._origin_s is not None:
             late_s = now_s - self._origin_s - (self._next + 1) * FRAME_S
@@ -216,8 +216,10 @@ class FrontEnd:
         return frames
 
     def statistics(self) -> Facts:
-        """Return those of the microphone (`LiveVoice`), and frames with a voice; with a reference, its own, frames in
-        which the robot spoke, and frames whose reference was not there in time.
+        """Return the statistics of the microphone (`LiveVoice`) and the number of frames with a voice.
+
+        With a reference also its own statistics if it is a `LiveVoice`, and the numbers of frames in which the robot
+        spoke and of frames whose reference came too late.
         """
         figures: Report = {**self.mic.statistics(), "voice_frames": self._counts["voice_frames"]}
         if self._reference is not None:
@@ -227,7 +229,7 @@ class FrontEnd:
         return figures
 
     def _judge(self, now_s: float, mic: Floats | None, said: Floats | None) -> MicrophoneFrame:
-        """Return a frame without the robot's own voice: one in, one out, since the gate counts samples."""
+        """Return a frame without the robot's own voice; every frame is passed, because the gate counts samples."""
         own = None if self._reference is None else (SILENCE if said is None else said)
         (frame,) = self._gate.push(SILENCE if mic is None else mic, own, self.speed_rad_s)
         self._counts["voice_frames"] += frame.voice
@@ -241,15 +243,16 @@ class FrontEnd:
 
 
 class Microphone:
-    """`ports.Voice` of the worker `listen`. Only `close` blocks.
+    """A `ports.Voice` of the frames from the worker `listen`. Only `close` blocks.
 
     Args:
-        early_s: by how much the robot's own voice is to be known earlier; None: it does not come by calls.
+        early_s: time by which the robot's own voice is sent earlier; None: it is not passed in by calls.
 
     Attributes:
-        own_voice: takes what the robot says in frame i, in order from 1 on, (640,) or None; None where none comes.
-        device: its name.
-        latency_s: the longest time from the end of a frame to the moment that its worker sent it, lately.
+        own_voice: function that receives the robot's voice in frame i, (640,) or None, in order from frame 1 on; None
+            if the voice is not passed in by calls.
+        device: name of the device.
+        latency_s: recent longest time from the end of a frame until the worker had it.
     """
 
     duration_s: float | None = None
@@ -272,7 +275,7 @@ class Microphone:
 
     @property
     def lost(self) -> bool:
-        """It gave sound, and has stopped."""
+        """True if it delivered sound before and has stopped."""
         return self._worker.lost
 
     def start(self, origin_s: float) -> None:
@@ -280,7 +283,7 @@ class Microphone:
         self._worker.tell(ToWorker(origin_s))
 
     def take(self, index: int) -> Floats | None:
-        """Return as `ports.Voice`."""
+        """Return the samples of a frame; see `ports.Voice`."""
         if self._origin_s is None:
             return None
         if self.own_voice is None and abs(self._speed_rad_s - self._sent_speed_rad_s) > _NEW_SPEED_RAD_S:
@@ -292,13 +295,13 @@ class Microphone:
         return None if heard is None else heard.audio
 
     def moves(self, speed_rad_s: float) -> None:
-        """Set how fast the joints of the head near it move, all together: their noise is judged by that."""
+        """Set the summed speed of the head's joints, which determines the expected noise of their motors."""
         self._speed_rad_s = speed_rad_s
 
     def _take_own_voice(self, index: int, said: Floats | None) -> None:
-        """Send the worker what the robot says in a frame, with the frames before it.
+        """Send the worker the robot's voice in a frame, with the frames before it.
 
-        A voice that is to be known early is so much sooner in what is sent, with silence at its end.
+        The samples sent are shifted earlier by `early_s`, with silence at the end.
         """
         self._own.append(SILENCE if said is None else said)
         if self._origin_s is not None:
@@ -310,11 +313,11 @@ class Microphone:
         self._worker.tell(ToWorker(origin_s, first, said, self._speed_rad_s))
 
     def said(self, index: int) -> Floats | None:
-        """Return what the loudspeaker near it was given in a frame that was taken just now."""
+        """Return the recorded signal of the loudspeaker in a frame that was taken just now."""
         return self._said.get(index)
 
     def statistics(self) -> Facts:
-        """Return device, latency, frames that came too late, state of the worker, and figures of the sound."""
+        """Return device, latency, frames that came too late, state of the worker, and statistics of the sound."""
         return {
             "device": self.device,
             **self._worker.statistics(),
@@ -351,10 +354,10 @@ class Microphone:
 
 
 class Loudspeaker:
-    """`ports.Voice` of what the robot says, where a device records it: late, as any recording.
+    """A `ports.Voice` of the robot's voice as a device records it; late, as any recording.
 
     Args:
-        recorder: the microphone with which it is recorded, or one for it alone.
+        recorder: the microphone whose worker also records this voice, or a `Microphone` for this voice alone.
     """
 
     duration_s: float | None = None
@@ -369,7 +372,7 @@ class Loudspeaker:
         return self._recorder.lost
 
     def take(self, index: int) -> Floats | None:
-        """Return what was recorded one frame before, with the microphone's; two before, without a microphone."""
+        """Return the sound recorded one frame before with the microphone, or two frames before without one."""
         return self._recorder.said(index - 1) if self._beside else self._recorder.take(index - 2)
 
     def statistics(self) -> Facts:
@@ -380,26 +383,26 @@ class Loudspeaker:
 def open_microphone(argument: str, agent: Voice | None = None) -> Microphone:
     """Open `--audio mic[:DEVICE]`: a number, a name or a part of one; "" is the default.
 
-    What `agent` says is taken out of what is heard; the microphone gets it by `own_voice`.
-    Blocks until it records, a second. Raises ConfigError for a device that is not there and without PortAudio,
-    PortError where there is no microphone or it cannot be opened.
+    The voice of `agent` is removed from the sound; the microphone receives it by `own_voice`.
+    Blocks until it records, a second. Raises ConfigError for an unknown device or if PortAudio is missing, PortError if
+    there is no microphone or it cannot be opened.
     """
     return _opened(argument, MIC_FLAG, early_s=None if agent is None else getattr(agent, "early_s", 0.0))
 
 
 def open_microphone_and_loudspeaker(argument: str, device: str) -> tuple[Microphone, Loudspeaker]:
-    """Open as `open_microphone`, without what `device` records of the robot's voice; return also that voice."""
+    """Open a microphone whose sound lacks the robot's voice as recorded by `device`; return also that voice."""
     microphone = _opened(argument, MIC_FLAG, device_name(device, DEVICE_FLAG))
     return microphone, Loudspeaker(microphone, beside=True)
 
 
 def open_loudspeaker(argument: str) -> Loudspeaker:
-    """Open `--agent-audio device:DEVICE` without a microphone. Raises and blocks as `open_microphone`."""
+    """Open `--agent-audio device:DEVICE` without a microphone. Blocks and raises as `open_microphone`."""
     return Loudspeaker(_opened(argument, DEVICE_FLAG), beside=False)
 
 
 def _opened(argument: str, flag: str, reference: str | None = None, early_s: float | None = None) -> Microphone:
-    """Open `flag`; `early_s`: the robot's own voice comes by calls, so much earlier."""
+    """Open the device of `flag`. `early_s`: the robot's voice is passed in by calls and sent this much earlier."""
     name, device = "microphone" if flag == MIC_FLAG else "loudspeaker", device_name(argument, flag)
     recording = Recording(device=device, flag=flag, reference=reference, spoken=early_s is not None)
     worker = SourceWorker(name, listen, recording)

@@ -1,4 +1,4 @@
-"""Messages between a robot and the programs it works with: values in, bytes out, and back. Opens no socket.
+"""Messages between a robot and other programs: values to bytes and back. Opens no socket.
 
 A message that begins with "{" is JSON (UTF-8), any other is binary, little-endian:
 
@@ -6,13 +6,13 @@ A message that begins with "{" is JSON (UTF-8), any other is binary, little-endi
     uint8    version, 1
     uint16   0
     uint32   samples a second; 0 for a face
-    float64  sent [s]: when it was sent, by the sender's clock, whatever its origin
+    float64  sent [s]: time of sending, by the sender's clock, which may have any origin
     float64  at [s]: by the same clock, when its newest sample was heard, the face was seen, or the first sample of
-             speech will be played; 0: as it arrives, speech behind what still waits
-    rest     int16 mono PCM; of a face 58 float32 (pose 6, blendshapes 52) or 59 (attention), or nothing: it is lost
+             speech will be played; 0: on arrival, speech after the speech that still waits
+    rest     int16 mono PCM; for a face 58 float32 (pose 6, blendshapes 52), 59 (attention), or no data: it is lost
 
-A WebSocket carries one in each of its messages. Over TCP each follows its length, uint32. docs/reference/protocol.md
-describes it for people who write the other side.
+Each WebSocket message carries one message. Over TCP each message follows its length, uint32.
+docs/reference/protocol.md describes the protocol for authors of other programs.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ VOICE, FACE, SPEECH, MICROPHONE = 1, 2, 3, 4
 FEEDS: Final = {VOICE: "voice", FACE: "face", SPEECH: "speech"}
 LONGEST: Final = 1_048_576  # bytes: 21.8 s at 24 kHz
 LONGEST_JSON: Final = 4096
-_WINDOW_S: Final = 10.0  # that a clock is remembered, once or twice
-_SET_S: Final = 1.0  # a message that took so much longer than the quickest: the clock was set
+_WINDOW_S: Final = 10.0  # length of a window of a clock's offsets; two windows are remembered
+_SET_S: Final = 1.0  # if a message took this much longer than the quickest, the sender's clock was set
 
 _HEADER: Final = struct.Struct("<BBHIdd")
 _SOUND_IS: Final = "sound comes in binary messages, int16 behind a header of 24 bytes (docs/reference/protocol.md)"
 _REALTIME: Final = re.compile(rb'"type"\s*:\s*"((?:session|input_audio_buffer|conversation|response)\.[\w.]+)"')
-# Files, by their first bytes.
+# First bytes of files, and the files' names in errors.
 _FILES: Final = {b"RIFF": "a WAV file", b"OggS": "an Ogg file", b"fLaC": "a FLAC file", b"ID3\x04": "an MP3 file"}
 
 
@@ -53,7 +53,7 @@ _Text = Annotated[str, Field(max_length=64), PRINTABLE]
 
 
 class Hello(BaseModel):
-    """The first message: what a program will send, and what it wants to be sent. `name` is its name in logs."""
+    """The first message of a program: which feeds it sends and what it wants to receive. `name`: its name in logs."""
 
     type: Literal["hello"]
     version: Literal[1]
@@ -64,7 +64,7 @@ class Hello(BaseModel):
 
 
 class Hush(BaseModel):
-    """The robot's remaining speech will not be played."""
+    """A message that drops the robot's remaining speech, which will not be played."""
 
     feed: ClassVar[str] = "speech"
     type: Literal["hush"]
@@ -72,7 +72,7 @@ class Hush(BaseModel):
 
 @dataclass(frozen=True, kw_only=True)
 class SoundMessage:
-    """Voice or speech, by `feed`. `samples` (n,) int16; times in seconds of the sender, `at_s` 0: none."""
+    """Voice or speech, by `feed`. `samples` (n,) int16; times in seconds of the sender's clock, `at_s` 0: not set."""
 
     feed: str
     rate_hz: int
@@ -83,7 +83,7 @@ class SoundMessage:
 
 @dataclass(frozen=True)
 class SeenMessage:
-    """A person's face, motion (58,), None: lost; times as of `SoundMessage`."""
+    """A person's face, motion (58,), or None: it is lost. Times as in `SoundMessage`."""
 
     feed: ClassVar[str] = "face"
     sent_s: float
@@ -97,7 +97,7 @@ _JSON: Final[TypeAdapter[Hello | Hush]] = TypeAdapter(Annotated[Hello | Hush, Fi
 
 
 def parse_message(data: bytes) -> Message:
-    """Return a message from a program. Raises PacketError, in one line, for anything but a whole message."""
+    """Parse a message from a program. Raises PacketError, in one line, for anything but one complete message."""
     if data[:1] == b"{":
         return _json(data)
     if len(data) > LONGEST:
@@ -158,7 +158,7 @@ def _face(rest: bytes, sent_s: float, at_s: float) -> SeenMessage:
 
 
 def sound_message(kind: int, rate_hz: int, sent_s: float, at_s: float, samples: NDArray[np.int16]) -> bytes:
-    """Return `samples` (n,) as a message of that kind."""
+    """Return `samples` (n,) as a message of the given kind."""
     return _HEADER.pack(kind, VERSION, 0, rate_hz, sent_s, at_s) + samples.astype("<i2").tobytes()
 
 
@@ -169,11 +169,11 @@ def json_message(**values: Any) -> bytes:
 
 @dataclass
 class SenderClock:
-    """The clock of a program that sends, in ours.
+    """Conversion from the clock of a sending program to ours.
 
-    Every message says when it was sent, by a clock of any origin. The message of the last seconds that took least time
-    on its way tells where that clock stands: its delay is taken as none. So a time is late by the shortest delay of the
-    way, and never early; a clock that drifts is followed. Holds the least `arrived - sent` of two windows.
+    Every message has its time of sending, by a clock of any origin. The message of the last seconds that took the least
+    time determines the offset of that clock: its delay counts as zero. So a converted time is late by the shortest
+    delay and never early, and a drifting clock is followed. Keeps the least `arrived - sent` of two windows.
     """
 
     _began_s: float = 0.0
@@ -181,7 +181,7 @@ class SenderClock:
     _last_least: float | None = None
 
     def observe(self, sent_s: float, arrived_s: float) -> None:
-        """Take in a message that arrived at `arrived_s` of `time.monotonic`."""
+        """Update the offset by a message that arrived at `arrived_s` of `time.monotonic`."""
         took = arrived_s - sent_s
         if self._now_least is None or took > self.offset_s + _SET_S:
             self._began_s, self._now_least, self._last_least = arrived_s, took, None
@@ -192,6 +192,6 @@ class SenderClock:
 
     @property
     def offset_s(self) -> float:
-        """Seconds to add to a time of the sender. 0 before the first message."""
+        """Seconds to add to a time of the sender; 0 before the first message."""
         known = [each for each in (self._now_least, self._last_least) if each is not None]
         return min(known, default=0.0)

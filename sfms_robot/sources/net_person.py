@@ -1,15 +1,15 @@
-"""Programs and visitors of the page in place of microphone, camera and loudspeaker.
+"""Programs and visitors of the page that replace microphone, camera and loudspeaker.
 
 `--audio push`, `--face push`, `--agent-audio tcp` (`NetPerson`): one server for all flags that name the same address.
-`--audio browser`, `--face browser` (`PageVisitor`): the visitor with the controls of the page. What they hand over goes
-through the sources of calls (`push`), with the sender's times in our clock; a program also receives what the run hears
-and does where it asks for that.
+`--audio browser`, `--face browser` (`PageVisitor`): the visitor with the controls of the page. Their sound and faces go
+through the sources of `push`, with the sender's times converted to our clock. A program also receives the run's sound
+and events if it requests them.
 
-1. One program feeds each of voice, face and speech. Another is refused by name until the first has gone; one that has
-   sent no voice, or no face, for `SILENT_S` loses its place to a program that asks for it.
+1. One program feeds each of voice, face and speech. Another is refused, with the name of the first, until the first
+   has disconnected. One that has sent no voice, or no face, for `SILENT_S` loses its place to a program that needs it.
 2. Beyond loopback a hello needs the token, which is new and printed at every start.
-3. One visitor is the person at a time: the next one has another clock, and another face at rest.
-4. While a program or visitor that brought a voice, or a face, is away, it counts as lost.
+3. One visitor is the person at a time: the next one has another clock and another resting face.
+4. While a program or visitor that fed a voice or a face is away, that voice or face counts as lost.
 """
 
 from __future__ import annotations
@@ -51,19 +51,19 @@ PORT: Final = 8765
 SILENT_S: Final = 2.0
 FLAGS: Final = {"voice": "--audio push", "face": "--face push", "speech": "--agent-audio tcp"}
 
-OLDEST_S: Final = 1.0  # of a voice or a face that is still of use
+OLDEST_S: Final = 1.0  # greatest age of a voice or a face that is still used
 _OLD: Final = f"its time (`at`) is more than {OLDEST_S:g} s ago, by the sender's clock"
-_SPARE_S: Final = 2.0  # of sound, that may arrive faster than time passes
+_SPARE_S: Final = 2.0  # seconds of sound that may arrive faster than real time
 
 _open: dict[tuple[str, int], NetPerson] = {}
 _opening: Final = threading.Lock()
 
 
 class Intake:
-    """Voice and face of one person, judged by their age and pace.
+    """Filter of one person's voice and face by age and pace.
 
     Attributes:
-        counts: messages that came too late, and sound that came faster than time passes.
+        counts: messages that were too old, and pieces of sound that came faster than real time.
     """
 
     def __init__(self, now: Clock) -> None:
@@ -73,7 +73,7 @@ class Intake:
         self._spared_s = now()
 
     def hear(self, voice: PushedVoice, message: SoundMessage, clock: SenderClock) -> str | None:
-        """Hand on the next piece of their voice; return why it was left out, or what is wrong. Never blocks."""
+        """Pass on the next piece of the voice; return why it was left out, or a fault of its pace. Never blocks."""
         now_s, at_s, old = self._times(message, clock)
         if old:
             return f"voice left out: {_OLD}"
@@ -88,7 +88,7 @@ class Intake:
         return voice.pace.problem
 
     def see(self, sight: PushedSight | BrowserSight, message: SeenMessage, clock: SenderClock) -> str | None:
-        """Hand on their face now, or that it is lost; return why it was left out. Never blocks."""
+        """Pass on the person's face, or that it is lost; return why it was left out, or None. Never blocks."""
         _, at_s, old = self._times(message, clock)
         if old:
             return f"face left out: {_OLD}"
@@ -96,14 +96,14 @@ class Intake:
         return None
 
     def at_s(self, message: SoundMessage | SeenMessage, clock: SenderClock) -> float | None:
-        """Return the time of a message in our clock; None: as it arrives."""
+        """Return the time of a message in our clock; None: its time is that of its arrival."""
         if not message.at_s:
             return None
         clock.observe(message.sent_s, self._now())
         return message.at_s + clock.offset_s
 
     def _times(self, message: SoundMessage | SeenMessage, clock: SenderClock) -> tuple[float, float | None, bool]:
-        """Return now, the time of a message, at most now, and whether it is too old."""
+        """Return the present time, the time of a message limited to it, and whether the message is too old."""
         now_s, at_s = self._now(), self.at_s(message, clock)
         old = at_s is not None and at_s < now_s - OLDEST_S
         self.counts["old"] += old
@@ -111,11 +111,11 @@ class Intake:
 
 
 class NetPerson(NetServer):
-    """The programs beside a run: which of them feeds what, and which are sent what.
+    """The server for programs that feed a run or receive its sound and events.
 
     Attributes:
-        now: `time.monotonic`, or a test's.
-        token: needed in a hello; None: not needed.
+        now: `time.monotonic`, or the clock of a test.
+        token: token that a hello needs; None: it needs none.
     """
 
     def __init__(self, flag: str, host: str, port: int, now: Clock = time.monotonic) -> None:
@@ -135,13 +135,13 @@ class NetPerson(NetServer):
     # --- from the run, in its threads ---
 
     def join(self, part: _NetPart) -> None:
-        """Give `part` what programs feed as its `feed`. Raises PortError when another one takes it already."""
+        """Pass to `part` what programs send as its `feed`. Raises PortError if another part has that feed already."""
         if part.feed in self._feeds:
             raise PortError(f"{FLAGS[part.feed]}: port {self.address[1]} is used by another run of this program")
         self._feeds[part.feed] = part
 
     def leave(self, part: _NetPart) -> None:
-        """Take a part away; the last one closes the server. Blocks until it is closed."""
+        """Remove a part; removing the last one closes the server and blocks until it is closed."""
         with _opening:
             self._feeds.pop(part.feed, None)
             if not self._feeds:
@@ -149,12 +149,12 @@ class NetPerson(NetServer):
                 self.close()
 
     def begin(self, origin_s: float) -> None:
-        """Set loop time 0 to `origin_s` of `time.monotonic`. From now on programs are answered."""
+        """Set loop time 0 to `origin_s` of `time.monotonic`, and serve programs from now on."""
         self._origin_s = origin_s
         self.start()
 
     def hears(self, audio: Floats, time_s: float) -> None:
-        """Send what the run hears, (640,), whose newest sample is of loop time `time_s`. Never blocks."""
+        """Send the listener's samples (640,), the newest of which is of loop time `time_s`. Never blocks."""
         at_s = self._origin_s + time_s
 
         def send() -> None:
@@ -179,7 +179,7 @@ class NetPerson(NetServer):
         self.post(send)
 
     def statistics(self) -> Facts:
-        """Return the server's counts, sound and faces that were too late or too fast, and which program feeds what."""
+        """Return the server's counts, counts of sound and faces too old or too fast, and the feeder of each feed."""
         feeders = {name: part.feeder for name, part in self._feeds.copy().items()}
         named = {name: feeder.name for name, feeder in feeders.items() if feeder is not None}
         return {**self.counts, **self._intake.counts, "feeders": named}
@@ -187,7 +187,7 @@ class NetPerson(NetServer):
     # --- from programs, in the server's thread ---
 
     def received(self, connection: NetProgram, message: Message) -> None:
-        """Hand a message to the part that it feeds. Raises PacketError for one that was not announced."""
+        """Pass a message to the part that it feeds. Raises PacketError if its feed was not announced."""
         if isinstance(message, Hello):
             self._greet(connection, message)
             return
@@ -210,10 +210,10 @@ class NetPerson(NetServer):
             connection.tell_once(problem)
 
     def gone(self, connection: NetProgram) -> None:
-        """Free the places of a program that has gone."""
+        """Free the places of a program that has disconnected."""
         for name, part in self._feeds.copy().items():
             if part.feeder is connection:
-                part.feeder, part.lost = None, name != "speech"  # a program with nothing to say is no loss
+                part.feeder, part.lost = None, name != "speech"  # a missing speech program is not a loss
                 logger.info("%s: %s has gone", FLAGS[name], connection.name)
                 if isinstance(part, NetSight):
                     part.see(None)
@@ -253,13 +253,13 @@ class NetPerson(NetServer):
 
 
 class _NetPart(SourcePart):
-    """A part of a person that another program feeds: it joins the server, which runs from its start to its close.
+    """A part of a person that another program feeds through a server, which runs from its start to its close.
 
-    argument: [HOST:]PORT, "" for the usual one; raises ConfigError, PortError. Or a server that runs already.
+    argument: [HOST:]PORT, "" for the usual port; raises ConfigError, PortError. Or an existing server.
 
     Attributes:
-        feeder: the program that feeds it; None: none does.
-        heard_s: when that sent something last, of `time.monotonic`.
+        feeder: the program that feeds it, or None.
+        heard_s: time of `time.monotonic` of the feeder's last message.
     """
 
     feed: ClassVar[str]
@@ -283,26 +283,26 @@ class _NetPart(SourcePart):
 
 
 class NetVoice(_NetPart, PushedVoice):
-    """`ports.Voice` of a person whose sound another program has: `--audio push[:[HOST:]PORT]`."""
+    """A `ports.Voice` of a person whose sound another program sends: `--audio push[:[HOST:]PORT]`."""
 
     feed = "voice"
     _way = FLAGS["voice"]
 
 
 class NetSight(_NetPart, PushedSight):
-    """`ports.Sight` of a person that another program sees: `--face push[:[HOST:]PORT]`."""
+    """A `ports.Sight` of a person whose face another program sends: `--face push[:[HOST:]PORT]`."""
 
     feed = "face"
 
 
 class NetSpeech(_NetPart, PushedSpeech):
-    """`ports.Voice` of a robot for which another program speaks: `--agent-audio tcp[:[HOST:]PORT]`."""
+    """A `ports.Voice` of the robot, whose speech another program sends: `--agent-audio tcp[:[HOST:]PORT]`."""
 
     feed = "speech"
 
 
 def _person(flag: str, argument: str) -> NetPerson:
-    """Return the person of an address, whose server runs from then on."""
+    """Return the server of an address; create it, and bind the address, if it does not exist yet."""
     place = host_and_port(argument) if argument else (LOOPBACK, PORT)
     if place is None:
         choices = f"{flag}, {flag}:PORT, {flag}:HOST:PORT; 0 for a free one"
@@ -317,10 +317,10 @@ def _person(flag: str, argument: str) -> NetPerson:
 
 
 class PageVisitor:
-    """The person in front of the page. All methods from any thread; none blocks.
+    """The person in front of the page. All methods may be called from any thread; none blocks.
 
     Attributes:
-        voice, sight: the person, as sources.
+        voice, sight: sources of the person's voice and face.
     """
 
     def __init__(self, now: Clock = time.monotonic) -> None:
@@ -332,7 +332,7 @@ class PageVisitor:
         self._clock, self._intake = SenderClock(), Intake(now)
 
     def came(self, number: int, feeds: Sequence[str]) -> None:
-        """Make visitor `number` the person, who brings `feeds` of voice and face, or none."""
+        """Make visitor `number` the person; `feeds`: which of voice and face the visitor sends, or none."""
         with self._lock:
             if number != self._number:
                 self._clock = SenderClock()
@@ -340,13 +340,13 @@ class PageVisitor:
             self._set(number, frozenset(feeds))
 
     def gone(self, number: int) -> None:
-        """Note that visitor `number` has gone, or has lost the controls."""
+        """Note that visitor `number` has left or has lost the controls."""
         with self._lock:
             if number == self._number:
                 self._set(None, frozenset())
 
     def received(self, number: int, data: bytes) -> None:
-        """Take a message of `net_messages`. Raises PacketError for any other, and for one that was not announced."""
+        """Process a message of `net_messages`. Raises PacketError for other data, and for a feed not announced."""
         with self._lock:
             message = parse_message(data)
             if isinstance(message, Hello | Hush) or message.feed == "speech":
@@ -359,7 +359,7 @@ class PageVisitor:
                 self._intake.see(self.sight, message, self._clock)
 
     def statistics(self) -> Facts:
-        """Return counts of messages that came too late, and of sound that came faster than time passes."""
+        """Return counts of messages that were too old, and of pieces of sound that came faster than real time."""
         return dict(self._intake.counts)
 
     def _set(self, number: int | None, feeds: frozenset[str]) -> None:
@@ -385,16 +385,16 @@ class BrowserVoice(PushedVoice):
 
 
 class BrowserSight(LiveFace):
-    """`ports.Sight` of a visitor. Their rest is learned while they are seen, as that of a person at a webcam."""
+    """`ports.Sight` of a visitor, whose resting face is learned while it is seen, as with a webcam."""
 
     def __init__(self, visitor: PageVisitor) -> None:
         super().__init__(now=visitor.now)
         self._visitor = visitor
 
     def see(self, face: Floats | None, seen_s: float | None = None, attention: float | None = None) -> None:
-        """Take their face (58,) at `seen_s` of `time.monotonic`, None: now; without one the last grows old and is lost.
+        """Add the visitor's face (58,) seen at `seen_s` of `time.monotonic`, None: now. A `face` of None is ignored.
 
-        Their attention is judged here, by head and eyes.
+        The last face then ages until it is lost. `attention` is not used: it is computed here from head and eyes.
         """
         if face is not None:
             self.put(self._now() if seen_s is None else seen_s, face)
@@ -404,12 +404,12 @@ class BrowserSight(LiveFace):
 
 
 def open_browser_voice(argument: str, visitor: PageVisitor | None = None) -> BrowserVoice:
-    """Open `--audio browser`. Raises ConfigError where no page is served, and for an argument: it takes none."""
+    """Open `--audio browser`. Raises ConfigError if no page is served, or for an argument, since it has none."""
     return _of_page("--audio", argument, visitor).voice
 
 
 def open_browser_sight(argument: str, visitor: PageVisitor | None = None) -> BrowserSight:
-    """Open `--face browser`, as `open_browser_voice`."""
+    """Open `--face browser`; raises as `open_browser_voice`."""
     return _of_page("--face", argument, visitor).sight
 
 

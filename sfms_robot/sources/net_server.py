@@ -1,16 +1,16 @@
-"""Server of the programs beside a run: takes connections, hands on messages, and sends.
+"""Server for programs that work with a run: accepts connections, passes on messages, and sends.
 
-A message travels behind its length (uint32) over TCP, or as one of a WebSocket; both share a port. A connection that
-begins with "GET " is HTTP and wants a WebSocket: as a length that would be more than any message has. Pages of the web
-may not connect: a browser says whose page it is, and only pages of this machine, or from the very address that they
-call, are admitted (`endpoint.origin_problem`).
+Over TCP a message follows its length (uint32); a WebSocket carries one in each of its messages. Both share a port. A
+connection that begins with "GET " is HTTP and requests a WebSocket: read as a length, these bytes are more than any
+message has. Pages of the web may not connect: a browser sends the page's origin, and only pages of this machine, or
+from the very address that they call, are admitted (`endpoint.origin_problem`).
 
-A client costs the servo loop no tick:
+A client cannot delay a tick of the servo loop:
 
-1. All of it happens in one thread. The loop hands over what is to be sent through a bounded queue.
-2. A connection is read in small turns with pauses between them: TCP itself holds up one that sends faster.
-3. A slow reader gets the newest `OUTBOX` messages; older ones are left out and counted.
-   What is wrong with its own messages is sent to each program, as a message of type "error", before it is counted.
+1. The server runs in one thread. The loop passes messages to send through a bounded queue.
+2. A connection is read in small turns with pauses between them: TCP itself holds up a client that sends faster.
+3. A slow reader receives the newest `OUTBOX` messages; older ones are left out and counted.
+   Faults of a program's own messages are sent to it, as messages of type "error", before they are counted.
 4. A client that sends no hello, or has gone without closing, is disconnected.
 """
 
@@ -40,12 +40,12 @@ logger = logging.getLogger(__name__)
 MOST_CONNECTIONS: Final = 8
 HELLO_S: Final = 5.0  # until the first message
 OUTBOX: Final = 50  # messages: two seconds of microphone
-TURN_MESSAGES: Final = 16  # of one connection, then a pause, in which the others are read
+TURN_MESSAGES: Final = 16  # read from one connection before a pause, in which the others are read
 TURN_BYTES: Final = 65_536
 TURN_S: Final = 0.01
-MOST_MALFORMED: Final = 100  # then the connection is closed
-LAST_WORDS_S: Final = 0.2  # that a program gets to read why it is closed
-_SLICE: Final = TURN_BYTES // TURN_MESSAGES  # bytes of a WebSocket that are read at once
+MOST_MALFORMED: Final = 100  # malformed messages; one more closes the connection
+LAST_WORDS_S: Final = 0.2  # time for a program to read why its connection closes
+_SLICE: Final = TURN_BYTES // TURN_MESSAGES  # bytes read at once from a WebSocket
 _MOST_READ: Final = 4 * LONGEST  # bytes of a WebSocket's message; a longer one closes the connection
 _STOP_S: Final = 2.0
 _HTTP: Final = b"GET "
@@ -54,17 +54,17 @@ _REASON: Final = 120  # bytes of a closing frame's text
 
 
 class NetServer(ServerThread):
-    """Holds one address from construction until `close`; clients wait until `start`. Raises PortError.
+    """A server that holds one address from construction until `close`; clients wait until `start`. Raises PortError.
 
-    A subclass decides what messages mean.
+    A subclass defines the meaning of messages.
 
     Args:
         flag: the option that names the address, for errors.
-        port: 0: any that is free.
+        port: TCP port; 0: any free one.
 
     Attributes:
-        counts: connections, refused ones, messages, malformed ones, and messages that slow readers missed.
-        connections: those that are open; for the server's thread.
+        counts: connections, refusals, messages, malformed messages, and messages that slow readers missed.
+        connections: the open connections; for the server's thread.
     """
 
     def __init__(self, flag: str, host: str, port: int) -> None:
@@ -75,18 +75,18 @@ class NetServer(ServerThread):
         self._posted = deque[Callable[[], None]](maxlen=4 * OUTBOX)
 
     def received(self, connection: NetProgram, message: Message) -> None:
-        """Take a message, in the server's thread.
+        """Process a message, in the server's thread.
 
-        Raises PacketError for one that this connection may not send: it is closed with that line.
+        Raises PacketError for a message that this connection may not send; the connection is closed with that line.
         """
         raise NotImplementedError
 
     def gone(self, connection: NetProgram) -> None:
-        """Note, in the server's thread, that a connection is closed, or about to be. Idempotent."""
+        """Note, in the server's thread, that a connection is closed or is about to be. Idempotent."""
         raise NotImplementedError
 
     def post(self, work: Callable[[], None]) -> None:
-        """Have `work` called in the server's thread; the oldest is dropped when too much waits. Never blocks."""
+        """Call `work` in the server's thread, soon. Too many waiting calls drop the oldest. Never blocks."""
         idle = not self._posted
         self._posted.append(work)
         if idle:
@@ -94,7 +94,7 @@ class NetServer(ServerThread):
                 self._loop.call_soon_threadsafe(self._work)
 
     def say_once(self, key: str, text: str) -> None:
-        """Log one line for `key`, whatever its numbers, the first time."""
+        """Log `text` the first time that `key` occurs, ignoring the numbers in it."""
         if self._said.first(key):
             logger.warning("%s (said once)", text)
 
@@ -120,14 +120,14 @@ class NetServer(ServerThread):
 
 
 class NetProgram:
-    """One program that is connected, over TCP or a WebSocket.
+    """A connected program, over TCP or a WebSocket.
 
     Attributes:
-        name: what it calls itself, and its address.
-        greeted: its hello was accepted.
-        malformed: count of its messages that could not be read.
-        clock: in which it says when it sent them.
-        wants: what it is sent.
+        name: its name from the hello, and its address.
+        greeted: True once its hello was accepted.
+        malformed: number of its messages that could not be read.
+        clock: conversion of its time stamps to our clock.
+        wants: kinds of messages that it requested.
     """
 
     def __init__(self, server: NetServer, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -143,7 +143,7 @@ class NetProgram:
         self._waiting = asyncio.Event()  # something to send
 
     async def run(self) -> None:
-        """Serve it until either side closes."""
+        """Serve the program until either side closes."""
         server = self._server
         server.counts["connections"] += 1
         if len(server.connections) >= MOST_CONNECTIONS:
@@ -159,34 +159,34 @@ class NetProgram:
         try:
             await self._receive()
         except (OSError, asyncio.IncompleteReadError):
-            pass  # it has gone
+            pass  # the program has disconnected
         except PacketError as error:
             self._fault("malformed", "closed", str(error))
         finally:
             deadline.cancel()
             sending.cancel()
             server.connections.discard(self)
-            server.gone(self)  # once more where it was ended here
+            server.gone(self)  # a second call if `end` was called before
             self._writer.close()
 
     def send(self, message: bytes) -> None:
-        """Send a message when the client reads: the newest ones. In the server's thread."""
+        """Queue a message until the client reads; only the newest are kept. Called in the server's thread."""
         self._server.counts["missed"] += len(self._outbox) == self._outbox.maxlen
         self._outbox.append(message)
         self._waiting.set()
 
     def tell(self, problem: str) -> None:
-        """Send what is wrong with its messages, as a message of type "error"; it stays connected."""
+        """Send a fault of the program's messages, as a message of type "error"; it stays connected."""
         self.send(json_message(type="error", error=problem))
 
     def tell_once(self, problem: str) -> None:
-        """Tell it, and the log, the first time of a problem, whatever its numbers."""
+        """Send and log a problem the first time that it occurs, ignoring the numbers in it."""
         if self._told.first(problem):
             self.tell(problem)
             self._server.say_once(problem, f"{self.name}: {problem}")
 
     def end(self, reason: str, refused: bool = True) -> None:
-        """Send the reason, as a message of type "error", and close. `refused`: the client is to blame."""
+        """Send the reason, as a message of type "error", and close. `refused`: the client caused it."""
         if self._over:
             return
         self._over = True
@@ -196,10 +196,10 @@ class NetProgram:
                 self._writer.write(self._wire.packed(message))
             self._writer.write(self._wire.closing(reason, refused))
         self._writer.close()
-        self._loop.call_later(HELLO_S, self.abort)  # a client that does not read does not keep it open
+        self._loop.call_later(HELLO_S, self.abort)  # a client that does not read cannot keep it open
 
     def abort(self) -> None:
-        """Close without a word."""
+        """Close without a message."""
         self._over = True
         self._writer.transport.abort()
 
@@ -247,7 +247,7 @@ class NetProgram:
             self._fault("refused", "closed", f"no hello within {HELLO_S:g} s")
 
     def _fault(self, count: str, done: str, reason: str, ends: bool = True) -> None:
-        """Tell it what is wrong, count and log that, and close it where it `ends`."""
+        """Send a fault to the program, count and log it, and close the connection if `ends`."""
         if not ends:
             self.tell(reason)
         self._server.counts[count] += 1
@@ -257,12 +257,12 @@ class NetProgram:
 
 
 class TcpWire:
-    """Each message behind its length."""
+    """TCP framing: each message follows its length."""
 
     async def messages(self, reader: asyncio.StreamReader, head: bytes) -> AsyncGenerator[bytes | None, None]:
-        """Yield messages, and None for anything else that cost time. `head`: the first four bytes.
+        """Yield messages, and None for other work that took time. `head`: the first four bytes.
 
-        Raises PacketError for bytes after which nothing can be read.
+        Raises PacketError for bytes after which the stream cannot be read.
         """
         while True:
             (length,) = _LENGTH.unpack(head)
@@ -272,16 +272,16 @@ class TcpWire:
             head = await reader.readexactly(_LENGTH.size)
 
     def packed(self, message: bytes) -> bytes:
-        """Return a message in the form that is sent; empty while the other side is not ready for any."""
+        """Return the bytes to send for a message; empty if the other side is not ready for messages."""
         return _LENGTH.pack(len(message)) + message
 
     def closing(self, reason: str, refused: bool) -> bytes:
-        """Return what is sent before the connection is closed."""
+        """Return the bytes to send before the connection is closed."""
         return b""
 
 
 class WebSocketWire:
-    """A WebSocket (RFC 6455), server's side; methods as of `TcpWire`."""
+    """The server's side of a WebSocket (RFC 6455); methods as in `TcpWire`."""
 
     def __init__(self, writer: asyncio.StreamWriter) -> None:
         self._protocol = ServerProtocol(max_size=_MOST_READ)
@@ -320,22 +320,22 @@ class WebSocketWire:
     def packed(self, message: bytes) -> bytes:
         try:
             (self._protocol.send_text if message[:1] == b"{" else self._protocol.send_binary)(message)
-        except WebSocketException:  # the handshake is not over, or the other side closes
+        except WebSocketException:  # the handshake is not complete, or the other side is closing
             return b""
         return self._answer()
 
     def closing(self, reason: str, refused: bool) -> bytes:
         code = CloseCode.POLICY_VIOLATION if refused else CloseCode.GOING_AWAY
-        with suppress(WebSocketException):  # it closes already
+        with suppress(WebSocketException):  # it is closing already
             self._protocol.send_close(code, reason.encode()[:_REASON].decode(errors="ignore"))
         return self._answer()
 
     def _answer(self) -> bytes:
-        """Return what the protocol itself has to send: a handshake, a pong."""
+        """Return the bytes that the protocol has to send, such as a handshake or a pong."""
         return b"".join(self._protocol.data_to_send())
 
     def _shake(self, request: Request) -> str | None:
-        """Answer a request for a WebSocket; return why it is refused."""
+        """Answer a request for a WebSocket; return the reason if it is refused, else None."""
         problem = origin_problem(request.headers.get("Origin"), request.headers.get("Host", ""))
         answer = self._protocol.accept(request) if problem is None else self._protocol.reject(403, f"{problem}\n")
         self._protocol.send_response(answer)
@@ -343,14 +343,14 @@ class WebSocketWire:
 
 
 def _line(error: BaseException) -> str:
-    """Return the innermost cause, on one line."""
+    """Return the text of the innermost cause, on one line."""
     while error.__cause__ is not None and isinstance(error, InvalidHandshake):
         error = error.__cause__
     return " ".join(str(error).split())[:160] or type(error).__name__
 
 
 def _find_the_dead(of: Any) -> None:
-    """Have the system find out within 11 s that a peer has gone without closing, where it can."""
+    """Let the system detect within 11 s that a peer has gone without closing, if it can (Linux)."""
     of.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     of.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     if sys.platform == "linux":

@@ -1,17 +1,17 @@
-"""The grid of 40 ms: a voice, a sight and the robot's own voice, each of any kind, as one source.
+"""The 40 ms grid, which joins a voice, a sight and the robot's own voice, each of any kind, to one source.
 
-1. Frame i covers (i, i + 1) x 40 ms of loop time. Every index yields exactly one frame, in order: a listener counts.
-2. A frame is given as soon as its voice is whole. When that takes `ALLOWANCE_S` longer than the voice's latency it is
-   given without (an overrun: empty audio), and the rest of it is discarded. No frame waits for longer than
-   `LONGEST_WAIT_S`, for a plan looks only a third of a second ahead.
-3. The face is the newest one, and none when that is older than `FACE_S` at the end of the frame. Of a recording it is
-   no newer than that; of something live up to one frame newer, when the frame is given later: a face does not wait for
-   the voice beside it, which comes some tens of milliseconds late.
-4. The robot's own voice is given one frame early, as a program that speaks knows it: frame i carries the samples of
-   frame i + 1, for which a listener plans its lips while it hears frame i.
-5. A sighting without the person's attention gets it from their face (`signals.attention`).
-6. Values that are not finite or not of the right shape are left out here, once for all: one NaN would stay in a
-   listener for good.
+1. Frame i covers (i, i + 1) x 40 ms of loop time. Every index has exactly one frame, in order: listeners count frames.
+2. A frame is returned as soon as its voice is complete. When that takes `ALLOWANCE_S` longer than the voice's latency,
+   the frame is returned with empty audio (an overrun), and the rest of its voice is discarded. No frame waits longer
+   than `LONGEST_WAIT_S`, because a plan reaches only a third of a second ahead.
+3. The face is the newest one, or None if that is older than `FACE_S` at the end of the frame. A recorded face is no
+   newer than the end of the frame. A live face may be up to one frame newer when the frame is returned late: a face
+   does not wait for the voice, which arrives some tens of milliseconds late.
+4. The robot's own voice comes one frame early, because a program that speaks has it in advance: frame i carries the
+   samples of frame i + 1, for which a listener plans its lips while it processes frame i.
+5. A sighting without an attention gets one computed from the face (`signals.attention`).
+6. Values that are not finite or have the wrong shape are left out here, in one place: a single NaN would stay in the
+   memory of a listener forever.
 """
 
 from __future__ import annotations
@@ -50,24 +50,24 @@ logger = logging.getLogger(__name__)
 ALLOWANCE_S: Final = 0.04
 LONGEST_WAIT_S: Final = 0.15
 FACE_S: Final = 0.25  # a face that is older counts as lost
-SMILED_FRAMES: Final = 1500  # after a smile this long a listener takes it for how the face looks
+SMILED_FRAMES: Final = 1500  # a listener treats a smile of this length as the neutral look of the face
 _SMILE: Final = 0.25
-_EPS: Final = 1e-6  # frames or seconds
+_EPS: Final = 1e-6  # tolerance, in frames or seconds
 
 
 class PairedSource:
-    """`ports.Source` of a voice and a sight; None for a part that is missing.
+    """A `ports.Source` made of a voice and a sight; each may be None.
 
     Args:
-        agent: what the robot itself says.
-        duration_s: length of the run; None: that of the voice, of the sight where there is no voice, and in any case
-            until the robot has said what it says.
+        agent: the robot's own voice.
+        duration_s: length of the run; None: that of the voice, or of the sight if there is no voice, but at least that
+            of the robot's own voice.
 
     Attributes:
-        duration_s: None for one without end.
+        duration_s: length of the run; None: without end.
         latency_s: see `ports.Voice`.
-        missing: of voice, face and agent_audio those that are lost.
-        outlets: those of its parts, each once.
+        missing: names of lost parts, of voice, face and agent_audio.
+        outlets: outlets of the parts, each once.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class PairedSource:
         self.outlets: Sequence[Outlet] = list(dict.fromkeys(each for each in behind if each is not None))
         self._judge = FrameJudge()
         self._given = 0
-        self._says: tuple[int, Floats | None] = (0, None)  # the newest frame of the robot's voice
+        self._says: tuple[int, Floats | None] = (0, None)  # index and samples of the newest frame of the robot's voice
         self._overruns = 0
         self._wait_ms = Quantiles()
         self._face_age_ms = Quantiles()
@@ -100,7 +100,7 @@ class PairedSource:
             part.start(origin_s)
 
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
-        """Return frames that are due by `now_s` and whole, or waited for long enough; oldest first. Never blocks."""
+        """Return frames that are due by `now_s` and complete, or too late to wait for; oldest first. Never blocks."""
         until_s = now_s if self.duration_s is None else min(now_s, self.duration_s)
         due = math.floor(until_s * FRAME_HZ + _EPS)
         frames: list[SpeakerFrame] = []
@@ -114,16 +114,16 @@ class PairedSource:
         return frames
 
     def moves(self, speed_rad_s: float) -> None:
-        """Pass on to a microphone; see `ports.Source`."""
+        """Pass the speed on to a microphone; see `ports.Source`."""
         if (moves := getattr(self._voice, "moves", None)) is not None:
             moves(speed_rad_s)
 
     def statistics(self) -> Facts:
-        """Return those of the grid, and under `voice`, `face` and `agent_audio` their own.
+        """Return statistics of the grid, and those of the parts under `voice`, `face` and `agent_audio`.
 
-        frames, overruns (frames without the voice that should be in them), faces_lost (frames whose face was too old),
-        left_out (by what it was), wait_ms from the end of a frame until it was given, face_age_ms at the end of its
-        frame.
+        frames, overruns (frames whose voice came too late), faces_lost (frames with no face or one that was too old),
+        left_out (counts by kind of value), wait_ms (from the end of a frame until it was returned), face_age_ms (at the
+        end of its frame).
         """
         figures: Report = {
             "frames": self._given,
@@ -142,7 +142,7 @@ class PairedSource:
             part.close()
 
     def _heard(self, index: int, now_s: float) -> Floats | None:
-        """Return the voice of a frame, empty where it is given up; None: wait."""
+        """Return the voice of a frame, empty if it is too late; None: the frame has to wait."""
         waited_s = max(0.0, now_s - (index + 1) / FRAME_HZ)
         heard: Floats | None = NO_SOUND
         if self._voice is not None:
@@ -172,14 +172,14 @@ class PairedSource:
         return self._judge.frame(index, heard, sighting, self._own_voice(index + 1))
 
     def _own_voice(self, index: int) -> Floats | None:
-        """Return what the robot says in a frame, asked for once."""
+        """Return the robot's voice in frame `index`; each frame is taken from its source only once."""
         if self._agent is not None and self._says[0] < index:
             self._says = (index, self._agent.take(index))
         return self._says[1]
 
 
 class JudgedSource:
-    """`ports.Source` around one of another package: its frames are judged, and put on the grid, as they come."""
+    """A `ports.Source` around a source of another package; checks its frames and numbers them as they come."""
 
     def __init__(self, inner: Source) -> None:
         """Raise ConfigError for an object that is not a source."""
@@ -196,7 +196,7 @@ class JudgedSource:
         self._given = 0
 
     def read(self, now_s: float) -> Sequence[SpeakerFrame]:
-        """Return the frames of the inner source; raises what it raises."""
+        """Return the checked frames of the inner source; raises the errors that it raises."""
         frames: list[SpeakerFrame] = []
         for given in self._inner.read(now_s):
             seen = None if given.face is None else Sighting(given.face, given.attention, given.place_m)
@@ -208,7 +208,7 @@ class JudgedSource:
         return frames
 
     def statistics(self) -> Facts:
-        """Return frames so far, what was left out of them, and the inner source's own statistics."""
+        """Return the number of frames, counts of values left out, and the inner source's own statistics."""
         return {"frames": self._given, "left_out": dict(self._judge.left_out), **self._inner.statistics()}
 
 
@@ -216,11 +216,11 @@ _SOURCE: Final = ("duration_s", "latency_s", "missing", "start", "read", "moves"
 
 
 class FrameJudge:
-    """Makes frames on the grid of unchecked values: 640 finite samples or none, a finite face or none.
+    """Converter of unchecked values to frames on the grid: 640 finite samples or none, a finite face or none.
 
     Attributes:
-        left_out: of how many frames the voice, the face, the attention, the place or the robot's voice was left out;
-            each is logged once.
+        left_out: number of frames from which the voice, face, attention, place or robot's voice was left out, by kind;
+            each kind is logged once.
     """
 
     def __init__(self) -> None:
@@ -229,7 +229,7 @@ class FrameJudge:
         self._attending = AttentionState()
 
     def frame(self, index: int, heard: Floats, seen: Sighting | None, says: Floats | None) -> SpeakerFrame:
-        """Return frame `index`, at its own time; its face keeps the time that it was seen, where that can be."""
+        """Return frame `index` at its time on the grid; its face keeps the time of the sighting if plausible."""
         time_s = (index + 1) / FRAME_HZ
         audio = self._samples(index, "voice", heard)
         own_audio = None if says is None else self._samples(index, "robot's voice", says)
@@ -265,7 +265,7 @@ class FrameJudge:
         return FaceFrame(time_s, pose, np.clip(shapes, 0.0, 1.0), jaw)
 
     def _finite(self, index: int, what: str, given: ArrayLike | None, shape: tuple[int, ...]) -> Floats | None:
-        """Return finite values of this shape; None for others, which count as left out, and where none are given."""
+        """Return finite values of this shape; None if none are given, or for others, which are counted as left out."""
         if given is None:
             return None
         values = np.asarray(given, dtype=np.float32)

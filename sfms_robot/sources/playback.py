@@ -1,11 +1,11 @@
-"""The robot's own voice, played: `--play [DEVICE]`, on a loudspeaker in another process (`play`).
+"""Playback of the robot's own voice, `--play [DEVICE]`, on a loudspeaker in another process (`play`).
 
-Speech leaves the loudspeaker `delay_s` after its time, by the device's own time stamps (`Playout`), and is reported at
-that time to everything beside it: the listener's lips, the state of the run and the echo canceller follow the sound
-that leaves. Speech that did not leave is silence for them too.
+Speech leaves the loudspeaker `delay_s` after its time, by the device's own time stamps (`Playout`), and has that later
+time in the rest of the program: the listener's lips, the state of the run and the echo canceller follow the sound that
+leaves. Speech that did not leave is silence for them too.
 
-A device that takes nothing for half a second went away: the process ends, and the next one begins with a PortAudio
-that sees the devices of that moment, until the device is back.
+A device that accepts no sound for half a second is lost: the process ends and is started again, with a PortAudio that
+lists the devices of that moment, until the device is back.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ logger = logging.getLogger(__name__)
 
 FLAG: Final = "--play"
 STATISTICS_S: Final = 1.0
-TURN_S: Final = 0.02  # between two looks at messages of the parent
-_MEASURED_BLOCKS: Final = 20  # from which the latency of the device is measured
-_LATEST_S: Final = 2.0  # a time stamp that is further away is of another clock
+TURN_S: Final = 0.02  # between two checks for messages of the parent
+_MEASURED_BLOCKS: Final = 20  # blocks from which the latency of the device is measured
+_LATEST_S: Final = 2.0  # a time stamp further ahead comes from another clock
 JUMP_S: Final = 0.02
-_EXACT_S: Final = 0.0005  # where a stretch begins, and in silence
+_EXACT_S: Final = 0.0005  # largest error at the begin of a stretch and in silence
 _UNREPORTED: Final = 64  # silences that wait to be reported
 DEFAULT: Final = "default"  # `--play` without a device
-MARGIN_S: Final = 0.08  # before the device wants what is said: a frame, two processes, a tick that is late
-HUSH_S: Final = 0.04  # until the worker knows of it
-EARLY_S: Final = 0.02  # of the echo canceller: a device's time stamps may be off, and no echo comes before its sound
-AHEAD_FRAMES: Final = 10  # that the worker knows beforehand, where they are known: the loop may be held up
-_KEPT: Final = AUDIO_HZ  # samples of what left
+MARGIN_S: Final = 0.08  # speech is known this long before the device needs it: a frame, two processes, a late tick
+HUSH_S: Final = 0.04  # until a hush reaches the worker
+EARLY_S: Final = 0.02  # lead of the echo canceller's reference: time stamps may be off, and no echo precedes its sound
+AHEAD_FRAMES: Final = 10  # frames sent in advance to the worker if they are known, because the loop may be held up
+_KEPT: Final = AUDIO_HZ  # samples kept after they left
 _FADE: Final = np.linspace(1.0, 0.0, AUDIO_HZ // 200, dtype=np.float32)  # 5 ms: a voice that is cut off clicks
 
 
 @dataclass(frozen=True)
 class PlaybackOpened:
-    """The first message. `latency_s`: from handing a sample over to its leaving, by the device's own word."""
+    """The first message of `play`. `latency_s`: from passing a sample to the device until it leaves, by its report."""
 
     device: str
     latency_s: float
@@ -62,7 +62,9 @@ class PlaybackOpened:
 
 @dataclass(frozen=True)
 class Speech:
-    """From the parent: what leaves from frame `first` of the loop on, (n x 640,); the newest replaces what was sent.
+    """A message from the parent: the samples (n x 640,) that leave from frame `first` of the loop on.
+
+    It replaces earlier messages.
 
     origin_s: loop time 0 in seconds of `time.monotonic`.
     """
@@ -74,7 +76,7 @@ class Speech:
 
 @dataclass(frozen=True)
 class Silence:
-    """Samples `first` to `last` - 1 of the loop did not leave."""
+    """A report that samples `first` to `last` - 1 of the loop did not leave the device."""
 
     first: int
     last: int
@@ -84,10 +86,10 @@ PlaybackMessage = PlaybackOpened | Silence | Report
 
 
 def play(wanted: str) -> Generator[PlaybackMessage | None, Speech | None, None]:
-    """Play what the parent sends; see `sources.worker`. `wanted`: a number, a name, a part of one; "": the default.
+    """Play the parent's messages; see `sources.worker`. `wanted`: a number, a name, a part of one; "": the default.
 
-    Raises ConfigError for a device that is not there and without PortAudio, PortError where nothing plays, for a device
-    that cannot be opened, and when it goes away.
+    Raises ConfigError for an unknown device or if PortAudio is missing; PortError if no device plays, or if the device
+    cannot be opened or is lost.
     """
     with closing(PlaybackStream.opened(wanted, FLAG)) as loudspeaker:
         playout = loudspeaker.playout
@@ -101,7 +103,7 @@ def play(wanted: str) -> Generator[PlaybackMessage | None, Speech | None, None]:
                 playout.tell(told.first, told.samples)
                 before = told
             loudspeaker.check()
-            messages: list[PlaybackMessage | None] = [None]  # and receive what the parent sends
+            messages: list[PlaybackMessage | None] = [None]  # yield at least once, to receive messages of the parent
             while playout.silences:
                 messages.append(playout.silences.popleft())
             if (now_s := time.monotonic()) >= next_statistics_s:
@@ -114,12 +116,12 @@ def play(wanted: str) -> Generator[PlaybackMessage | None, Speech | None, None]:
 
 
 class PlaybackStream(DeviceStream):
-    """A device that plays what a `Playout` gives; sound flows once its latency was measured."""
+    """A device that plays the blocks of a `Playout`; it counts as started once its latency was measured."""
 
     plays = True
-    wanted_latency_s = 0.05  # what is on its way out cannot be hushed any more
+    wanted_latency_s = 0.05  # short, because sound that was passed to the device cannot be hushed
     start_limit_s = 1.0
-    lost_s = 0.5  # more than a busy computer takes
+    lost_s = 0.5  # longer than the delays of a busy computer
 
     def __init__(self, device: SoundDevice, rate_hz: float, channels: int) -> None:
         super().__init__(device, rate_hz, channels)
@@ -127,7 +129,7 @@ class PlaybackStream(DeviceStream):
         self._latencies_s: list[float] = []
 
     def latency_s(self) -> float:
-        """Return the median of the newest blocks."""
+        """Return the median latency of the newest blocks."""
         return median(self._latencies_s)
 
     def _called(self, out: Floats, n: int, stamp: Any, status: Any) -> None:
@@ -140,58 +142,58 @@ class PlaybackStream(DeviceStream):
             self._flows.set()
         block = self.playout.block(n, now_s + latency_s, bool(status.output_underflow))
         out[:, :STEREO] = np.clip(block, -1.0, 1.0)[:, None]
-        out[:, STEREO:] = 0.0  # those of a room
+        out[:, STEREO:] = 0.0  # further loudspeakers of a room
 
 
 def leaves_after_s(ahead_s: float | None, usual_s: float) -> float:
-    """Return how long after the request a block leaves: what the device says, `ahead_s`, where that can be."""
+    """Return how long after the request a block leaves: the device's value `ahead_s` if plausible, else `usual_s`."""
     return ahead_s if ahead_s is not None and 0.0 <= ahead_s <= _LATEST_S else usual_s
 
 
-# --- from what is said, in frames of the loop, to what the device is handed ---------------------------------------
+# --- from speech in frames of the loop to blocks for the device ----------------------------------------------------
 #
 # Every sample leaves the device at its time. The grid of the loop is the only clock: sample s, 16 kHz, leaves the
-# loudspeaker s / 16000 after loop time 0, whatever the device's rate and drift. The device says of every block when it
-# leaves; `SampleClock` computes from that the time of every sample, and the next block is the signal at the instants at
-# which it leaves: its rate is the card's true one, and a little more or less where it is ahead or behind, 1 % at most.
-# Nothing is cut out or put in but for these cases:
+# loudspeaker s / 16000 after loop time 0, for any rate and drift of the device. The device reports for every block when
+# it leaves; `SampleClock` computes from that the time of every sample, and the next block is the signal at the instants
+# at which it leaves. Its rate is the card's true rate, changed by at most 1 % when it is ahead or behind. Samples are
+# cut out or inserted in these cases only:
 #
-# 1. The device had nothing to play for a while. What was due then is not said any more; what follows is on time again.
-# 2. What is handed over is off by more than `JUMP_S`, or at all while nothing sounds: it jumps to its place.
-# 3. A sample arrives too late: the device has had zeros for it.
+# 1. The device had nothing to play for a while. Speech that was due then is dropped; later speech is on time again.
+# 2. The position is off by more than `JUMP_S`, or at all in silence: it jumps to its place.
+# 3. A sample arrives too late: the device has already played zeros in its place.
 #
-# What did not leave is reported (`Silence`), so that the rest of the program does not take it for said.
+# Speech that did not leave is reported (`Silence`), so that the rest of the program does not treat it as said.
 
 
 class Playout:
-    """One device. `block` is called in one thread, the rest in another.
+    """The samples for one device. `block` is called in one thread, the other methods in another.
 
     Args:
-        rate_hz: of the device, by its own word.
+        rate_hz: nominal rate of the device.
 
     Attributes:
-        silences: not reported yet; the oldest is taken from the left.
+        silences: silences not reported yet; the oldest is on the left.
     """
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
         self._origin_s: float | None = None
-        self._said: tuple[int, Floats] = (0, np.zeros(1, np.float32))  # from which sample of the loop on, and what
+        self._said: tuple[int, Floats] = (0, np.zeros(1, np.float32))  # first sample of the loop, and the samples
         self._clock: SampleClock | None = None  # None: the next block begins a stretch
-        self._skew = 0.0  # of the card, kept over its silences
-        self._count = 0  # samples of the stretch that were handed over
-        self._next = 0.0  # sample of the loop that is handed over next
-        self._settled = False  # it continues where the last block ended
+        self._skew = 0.0  # skew of the card, kept over its silences
+        self._count = 0  # samples of the stretch that were passed to the device
+        self._next = 0.0  # sample of the loop that is passed next
+        self._settled = False  # True: the next block continues where the last one ended
         self.silences = deque[Silence](maxlen=_UNREPORTED)
         self._counts = {"underruns": 0, "jumps": 0}
-        at_positions(np.zeros(1, np.float32), np.zeros(1))  # makes its table now, not in the callback of the device
+        at_positions(np.zeros(1, np.float32), np.zeros(1))  # computes its table now, not in the callback of the device
 
     def start(self, origin_s: float) -> None:
         """Set loop time 0 to `origin_s` of `time.monotonic`."""
         self._origin_s, self._next, self._settled = origin_s, 0.0, False
 
     def tell(self, first: int, samples: Floats) -> None:
-        """Set what is to leave from frame `first` on, (n x 640,), n > 0, instead of what was set before."""
+        """Set the samples (n x 640,), n > 0, that leave from frame `first` on; they replace those set before."""
         self._said = (first * FRAME_SAMPLES, samples)
 
     def block(self, n: int, leaves_s: float, dry: bool = False) -> Floats:
@@ -213,11 +215,11 @@ class Playout:
         return at_positions(said, begins - first + ratio * np.arange(n, dtype=np.float64))
 
     def statistics(self) -> Facts:
-        """Return how often the device ran dry, jumps, and the drift of the card."""
+        """Return how often the device had nothing to play, the number of jumps, and the drift of the card."""
         return {**self._counts, "drift_ppm": None if self._clock is None else round(self._clock.drift_ppm, 1)}
 
     def _followed(self, leaves_s: float, dry: bool) -> SampleClock:
-        """Return the clock, which has seen this block; a new one where the block does not follow the last one."""
+        """Return the clock, updated by this block; a new clock if the block does not follow the last one."""
         if self._clock is not None and (dry or self._clock.lateness_s(self._count, leaves_s) > GAP_S):
             self._counts["underruns"] += self._origin_s is not None
             self._clock, self._settled = None, False
@@ -228,7 +230,7 @@ class Playout:
         return self._clock
 
     def _place(self, due: float, n: int) -> None:
-        """Move to what is due, where the next sample is not nearly that; `n`: samples of the loop that come."""
+        """Move to the sample that is due if the next one is too far from it; `n`: samples of the loop in the block."""
         first, said = self._said
         begins, ends = (max(0, math.floor(at(self._next, due)) - first) for at in (min, max))
         sounds = bool(said[begins : ends + n].any())
@@ -248,18 +250,18 @@ class Playout:
 
 
 class PlayedVoice:
-    """`ports.Voice` of what leaves the loudspeaker, of all that `spoken` says. Only `close` blocks.
+    """A `ports.Voice` of the speech of `spoken` as it leaves the loudspeaker. Only `close` blocks.
 
     Args:
-        loudspeaker: the worker of `playback_worker.play`; its first message has arrived.
-        now: `time.monotonic`, or a test's.
+        loudspeaker: the worker of `play`; its first message has arrived.
+        now: `time.monotonic`, or the clock of a test.
 
     Attributes:
-        device: its name.
-        delay_s: from when something is said until it leaves.
-        duration_s: until all that is said has left; None for one without end.
-        outlet: the programs behind what is said.
-        early_s: by how much an echo canceller gets it too early.
+        device: name of the device.
+        delay_s: from the time of a sample in `spoken` until it leaves.
+        duration_s: time until all speech has left; None: without end.
+        outlet: the server of the program that sends the speech, or None.
+        early_s: time by which an echo canceller receives the voice too early.
     """
 
     latency_s = 0.0
@@ -270,9 +272,9 @@ class PlayedVoice:
         self.device = ""
         self.delay_s = self._device_s = 0.0
         self._origin_s: float | None = None
-        self._turn = threading.Lock()  # of sending to the loudspeaker
+        self._turn = threading.Lock()  # held while sending to the loudspeaker
         self._next = 0  # frame of `spoken` that is taken next
-        self._leaves: tuple[int, Floats] = (0, NO_SOUND)  # from which sample of the loop on, and what
+        self._leaves: tuple[int, Floats] = (0, NO_SOUND)  # first sample of the loop, and the samples that leave
         self._speaks = False
         self._unsaid = 0
         self._told: Facts = {}
@@ -282,7 +284,7 @@ class PlayedVoice:
 
     @property
     def lost(self) -> bool:
-        """The device is away: the robot is not heard."""
+        """True while the device is lost, so that the robot cannot be heard."""
         return self._loudspeaker.lost
 
     def start(self, origin_s: float) -> None:
@@ -293,11 +295,11 @@ class PlayedVoice:
             self._tell()
 
     def take(self, index: int) -> Floats | None:
-        """Return the (640,) that leave in frame `index`, silence where there is none; None until something was said.
+        """Return the samples (640,) that leave in frame `index`, silence in pauses; None until the first speech.
 
-        A frame that is still to come is what will leave, as far as that is known.
+        For a future frame, return the samples that will leave, as far as they are known.
         """
-        if self._origin_s is not None and self._turn.acquire(blocking=False):  # else another thread is at it
+        if self._origin_s is not None and self._turn.acquire(blocking=False):  # else another thread is sending
             try:
                 self._collect()
                 self._tell()
@@ -309,13 +311,13 @@ class PlayedVoice:
         return window(begin, NO_SOUND if self.lost else leaves, index * FRAME_SAMPLES)
 
     def said(self) -> None:
-        """Send what is new; see `Player`."""
+        """Send new speech to the loudspeaker; see `Player`."""
         with self._turn:
             if self._origin_s is not None:
                 self._tell()
 
     def hushed(self) -> None:
-        """Play nothing more than what is on its way out of the device; see `Player`."""
+        """Drop all speech except that which the device is already playing; see `Player`."""
         with self._turn:
             if self._origin_s is None:
                 return
@@ -328,7 +330,7 @@ class PlayedVoice:
             self._tell()
 
     def statistics(self) -> Facts:
-        """Return device, process, delay, how often it ran dry, sound not heard [ms]; and those of what is said."""
+        """Return statistics of device and process, delay and speech that did not leave [ms], and those of `spoken`."""
         return {
             "device": self.device, **self._loudspeaker.statistics(), **self._told,
             "delay_ms": round(self.delay_s * 1e3, 1), "unsaid_ms": round(self._unsaid / AUDIO_HZ * 1e3, 1),
@@ -340,7 +342,7 @@ class PlayedVoice:
         self._spoken.close()
 
     def _tell(self) -> None:
-        """Send the loudspeaker what leaves from now on, with what is known of what comes after it."""
+        """Send the loudspeaker the samples that leave from now on, and the known frames after them."""
         self._take_in()
         assert self._origin_s is not None
         begin, leaves = self._leaves
@@ -352,7 +354,7 @@ class PlayedVoice:
         self._loudspeaker.tell(Speech(self._origin_s, first, samples[:whole]))
 
     def _take_in(self) -> None:
-        """Fix what was said up to the frame that is in progress: it will leave; forget what left long ago."""
+        """Take the speech up to the frame in progress, which will leave; forget samples that left long ago."""
         begin, leaves = self._leaves
         now = self._sample(self._now())
         pieces = []
@@ -372,7 +374,7 @@ class PlayedVoice:
     def _collect(self) -> None:
         for message in self._loudspeaker.messages(self._now()):
             if isinstance(message, PlaybackOpened):
-                if not self.device:  # one that is back may be quicker or slower: what is said keeps its delay
+                if not self.device:  # a returning device may have another latency: speech keeps its delay
                     self.delay_s = round((message.latency_s + MARGIN_S) * AUDIO_HZ) / AUDIO_HZ
                 self.device, self._device_s = message.device, message.latency_s
             elif isinstance(message, Silence):
@@ -384,7 +386,7 @@ class PlayedVoice:
         begin, leaves = self._leaves
         first, last = (min(max(at - begin, 0), len(leaves)) for at in (silence.first, silence.last))
         lacks = int(np.count_nonzero(leaves[first:last]))
-        if lacks and silence.first and not self._unsaid:  # from the first sample on: it was away, and that is said
+        if lacks and silence.first and not self._unsaid:  # from 0 on: the device was lost, which is logged already
             text = "loudspeaker: %s had nothing to play for %.0f ms while the robot spoke (said once)"
             logger.warning(text, self.device, lacks / AUDIO_HZ * 1e3)
         self._unsaid += lacks
@@ -396,10 +398,10 @@ def _sounding(piece: Floats | None) -> Floats:
 
 
 def open_playback(argument: str, spoken: Spoken) -> PlayedVoice:
-    """Play what `spoken` says on a device by number, name or a part of one; "default" is the default.
+    """Play the speech of `spoken` on a device by number, name or a part of one; "default" is the default device.
 
-    Blocks until it plays, a second. Raises ConfigError for a device that is not there and without PortAudio, PortError
-    where there is no loudspeaker or it cannot be opened.
+    Blocks until it plays, a second. Raises ConfigError for an unknown device or if PortAudio is missing, PortError if
+    there is no loudspeaker or it cannot be opened.
     """
     worker = SourceWorker("loudspeaker", play, device_name("" if argument == DEFAULT else argument, FLAG, plays=True))
     worker.wait()

@@ -1,8 +1,8 @@
-"""A person handed over by calls, from any thread: sound, faces, and the robot's own speech.
+"""A person's sound and faces, and the robot's own speech, passed in by calls from any thread.
 
-A call brings no time of its own, so sound counts from the moment it arrives: a piece is played out from then on, and
-the next ones follow it. Where pieces are long, that leaves room for the longest of them; where they come in bursts,
-for the longest wait between two.
+A call without a time stamp counts from the moment it arrives: a piece of sound begins then, and the next pieces follow
+it. This delays the sound by the length of the longest piece, or, if pieces come in bursts, by the longest wait between
+two bursts.
 """
 
 from __future__ import annotations
@@ -26,44 +26,44 @@ from sfms_robot.sources.live_voice import Clock, LiveVoice, Pace, SourcePart, ch
 
 Pcm = bytes | Reals | NDArray[np.int16]
 
-HEARD_S: Final = 1.0  # a person's voice that is older than this is no use to a listener
-SAID_S: Final = 120.0  # speech is synthesized faster than it is spoken, a sentence at once
-SIGHTINGS: Final = 64  # kept: more than a camera sees between two ticks
+HEARD_S: Final = 1.0  # a listener cannot use a person's voice that is older than this
+SAID_S: Final = 120.0  # speech that may wait: it is synthesized faster than it is spoken, a sentence at once
+SIGHTINGS: Final = 64  # sightings kept: more than a camera delivers between two ticks
 _JOIN: Final = round(0.02 * AUDIO_HZ)
 _MOST_CHANNELS: Final = 32
 
 
 class Player(Protocol):
-    """Plays what is said. All methods from any thread; none waits for a device.
+    """A player of speech. All methods may be called from any thread; none waits for a device.
 
     Attributes:
-        delay_s: from the time of a sample of what is said until it leaves the loudspeaker.
+        delay_s: from the time of a sample of speech until it leaves the loudspeaker.
     """
 
     delay_s: float
 
     def said(self) -> None:
-        """There is something new to say."""
+        """Note that there is new speech to play."""
 
     def hushed(self) -> None:
-        """Nothing more is said from now on."""
+        """Note that the speech ends now."""
 
 
 class Spoken(Voice, Protocol):
     """A voice that can be played."""
 
     def upcoming(self, index: int) -> Floats | None:
-        """Return what is known by now of frame `index`, (640,), which was not taken yet: it may change until it is."""
+        """Return the samples (640,) known so far of frame `index`, not taken yet; they may change until it is taken."""
 
     def played_by(self, player: Player) -> None:
         """Report every change to `player` at once, from now on."""
 
 
 class PushedVoice(LiveVoice):
-    """`ports.Voice` of what a program hears.
+    """A `ports.Voice` of sound that a program passes to `hear`.
 
     Attributes:
-        pace: at which it comes. What is wrong with it is logged once.
+        pace: pace at which the sound arrives; a fault of it is logged once.
     """
 
     _way = "hear()"  # in logs
@@ -71,16 +71,16 @@ class PushedVoice(LiveVoice):
     def __init__(self, now: Clock = time.monotonic) -> None:
         super().__init__(now)
         self._pushing = threading.Lock()
-        self._longest_s = 0.0  # piece
+        self._longest_s = 0.0  # delay of the sound: the longest piece, or wait between bursts
         self._last_s = 0.0
         self._dropped = 0
         self.pace = Pace()
 
     def hear(self, pcm: Pcm, rate_hz: float, captured_s: float | None = None) -> None:
-        """Take the next piece, float of full scale 1 or int16: (n,), (n, channels) or (channels, n); or bytes of mono.
+        """Add the next piece, float of full scale 1 or int16: (n,), (n, channels) or (channels, n); or bytes of mono.
 
-        Of one that is longer than a second the newest is kept. `captured_s`: `time.monotonic` of its newest sample;
-        None: it counts from this call on. Never blocks. Raises ConfigError for another rate, type, shape or scale.
+        Of a piece longer than a second the newest second is kept. `captured_s`: `time.monotonic` of its newest sample;
+        None: it begins at this call. Never blocks. Raises ConfigError for another rate, type, shape or scale.
         """
         check_rate(rate_hz)
         samples = as_floats(pcm)
@@ -112,7 +112,7 @@ class PushedVoice(LiveVoice):
 
 
 class PushedSight(SourcePart):
-    """`ports.Sight` of what a program sees."""
+    """A `ports.Sight` of faces that a program passes to `see`."""
 
     def __init__(self, now: Clock = time.monotonic) -> None:
         super().__init__(now)
@@ -124,13 +124,13 @@ class PushedSight(SourcePart):
         seen_s: float | None = None,
         attention: float | None = None,
     ) -> None:
-        """Take the person's face, as a `FaceFrame`, (58,) motion or channels by name; None: it is lost. Never blocks.
+        """Set the person's face: a `FaceFrame`, (58,) motion or channels by name; None: it is lost. Never blocks.
 
         Args:
-            seen_s: `time.monotonic` when it was seen, no earlier than the last one; None: now.
+            seen_s: `time.monotonic` when it was seen, no earlier than that of the last call; None: now.
             attention: see `Sighting`.
 
-        Raises ConfigError for another shape, an unknown channel, and a value beyond what a head can do.
+        Raises ConfigError for another shape, an unknown channel, or a value beyond what a head can do.
         """
         if isinstance(face, Mapping):
             face = motion_of(face)
@@ -145,7 +145,7 @@ class PushedSight(SourcePart):
             self._seen.append((at_s, None if face is None else Sighting(face, attention)))
 
     def at(self, time_s: float) -> Sighting | None:
-        """Return as `ports.Sight`; None also from the moment on in which the face was lost."""
+        """Return the newest sighting, see `ports.Sight`; None also from the time on at which the face was lost."""
         with self._lock:
             for seen_s, sighting in reversed(self._seen):
                 if seen_s - self._origin_s <= time_s:
@@ -154,38 +154,38 @@ class PushedSight(SourcePart):
 
 
 class PushedSpeech(SourcePart):
-    """`ports.Voice` of what the robot says, each sample at the time at which it is played.
+    """A `ports.Voice` of the robot's speech, with each sample at the time at which it is played.
 
-    Speech is synthesized faster than it is spoken: two minutes may wait. `take` returns None until something was said,
-    silence after that. All methods may be called from any thread; `take` waits for none of them.
+    Speech is synthesized faster than it is spoken, so two minutes of it may wait. `take` returns None until the first
+    speech, and silence in later pauses. All methods may be called from any thread; `take` waits for none of them.
     """
 
     def __init__(self, now: Clock = time.monotonic) -> None:
         super().__init__(now)
-        self._saying = threading.Lock()  # of `say` and `hush`: the stretch that is resampled
+        self._saying = threading.Lock()  # for `say` and `hush`: guards the stretch that is resampled
         self._rate_hz = float(AUDIO_HZ)
         self._mix = Downmix()
         self._resampler: Resampler | None = None  # None: the next piece begins a stretch
         self._given = 0  # samples of the stretch, at its rate
-        self._began = 0  # samples of 16 kHz since 0 of `now`, as all places
-        self._place = 0  # of the next sample that comes out of the resampler
-        # To be played; the lock is held for no longer than a list takes.
+        self._began = 0  # begin of the stretch, in samples of 16 kHz since 0 of `now`, as all places
+        self._place = 0  # place of the next sample that the resampler returns
+        # Pieces to be played; `_lock` is held only for operations on this list.
         self._pieces = deque[tuple[int, Floats]]()
         self._origin = 0
-        self._taken = 0  # up to here it has been asked for
+        self._taken = 0  # end of the last frame that was taken
         self._speaks = False
         self._counts = {"dropped": 0, "late": 0, "not_finite": 0}
         self._player: Player | None = None
 
     def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
-        """Take what it says, as `PushedVoice.hear`.
+        """Add a piece of speech, in the formats of `PushedVoice.hear`.
 
         Args:
-            at_s: `time.monotonic` when its first sample is played; what was to be played from then on is replaced.
-                None: behind what still waits, or one frame (40 ms) after this call.
+            at_s: `time.monotonic` when its first sample is played; speech that was to be played from then on is
+                replaced. None: after the speech that still waits, or one frame (40 ms) after this call.
 
-        A piece that is within 20 ms of the end of the last one follows it. Stay ahead of what is played: what comes
-        later than that is left out, and counted. So is what is to be played later than in two minutes.
+        A piece that begins within 20 ms of the end of the last one follows it. Samples that come after their time, and
+        samples to be played in more than two minutes, are left out and counted.
         """
         check_rate(rate_hz)
         if at_s is not None and not np.isfinite(at_s):
@@ -208,7 +208,7 @@ class PushedSpeech(SourcePart):
             self._player.said()
 
     def hush(self) -> None:
-        """Drop what is still to be played from now on."""
+        """Drop all speech that is not yet played."""
         with self._saying:
             self._resampler, self._began, self._given = None, _place(self._now()), 0
             self._cut(self._began)
@@ -216,7 +216,7 @@ class PushedSpeech(SourcePart):
             self._player.hushed()
 
     def played_by(self, player: Player) -> None:
-        """Let `player` play it: without a time as soon as it can; `at_s` is when it leaves the loudspeaker."""
+        """Play the speech on `player`: at `at_s` it leaves the loudspeaker; without `at_s`, as soon as possible."""
         self._player = player
 
     def start(self, origin_s: float) -> None:
@@ -224,12 +224,12 @@ class PushedSpeech(SourcePart):
             self._origin = _place(origin_s)
 
     def take(self, index: int) -> Floats | None:
-        """Return the (640,) that are played in frame `index`, silence where there are none."""
+        """Return the samples (640,) that are played in frame `index`; silence where there is no speech."""
         begin = self._origin + index * FRAME_SAMPLES
-        if self._saying.acquire(blocking=False):  # else more is being said at this very moment
+        if self._saying.acquire(blocking=False):  # else another thread is adding speech
             try:
                 if self._resampler is not None and self._place < min(begin + FRAME_SAMPLES, self._end):
-                    self._finish()  # nothing more will come in time
+                    self._finish()  # no further piece can come in time
             finally:
                 self._saying.release()
         with self._lock:
@@ -241,22 +241,22 @@ class PushedSpeech(SourcePart):
             return self._frame(begin)
 
     def upcoming(self, index: int) -> Floats | None:
-        """Return as `Spoken`."""
+        """Return the samples (640,) known so far of a frame; see `Spoken`."""
         with self._lock:
             return self._frame(self._origin + index * FRAME_SAMPLES) if self._speaks else None
 
     def statistics(self) -> Facts:
-        """Return samples to be played in more than two minutes (dropped), said too late to be played, or not finite."""
+        """Return counts of samples: to be played in more than two minutes (dropped), too late to play, not finite."""
         with self._lock:
             return dict(self._counts)
 
     @property
     def _end(self) -> int:
-        """Where the stretch ends, with what its resampler still holds."""
+        """End of the stretch, including samples that its resampler still holds."""
         return self._began + round(self._given * AUDIO_HZ / self._rate_hz)
 
     def _frame(self, begin: int) -> Floats:
-        """Return the (640,) from place `begin` on."""
+        """Return the samples (640,) from place `begin` on."""
         frame = SILENCE.copy()
         for place, piece in self._pieces:
             if place >= begin + FRAME_SAMPLES:
@@ -271,14 +271,14 @@ class PushedSpeech(SourcePart):
         self._began = self._place = at
 
     def _finish(self) -> None:
-        """End the stretch: let out what the resampler still holds."""
+        """End the stretch and append the samples that the resampler still holds."""
         if self._resampler is not None:
             end = self._end
             self._append(self._resampler.push(NO_SOUND, last=True))
             self._resampler, self._began, self._given = None, end, 0
 
     def _cut(self, at: int) -> None:
-        """Drop what was to be played from `at` on."""
+        """Drop the samples to be played from `at` on."""
         with self._lock:
             while self._pieces and self._pieces[-1][0] + len(self._pieces[-1][1]) > at:
                 place, piece = self._pieces.pop()
@@ -301,7 +301,7 @@ def _place(time_s: float) -> int:
 
 
 def as_floats(pcm: Pcm) -> Floats:
-    """Return sound as (n,) or (n, channels) of full scale 1; the smaller axis is that of channels.
+    """Return sound as (n,) or (n, channels) with full scale 1; the smaller axis is that of channels.
 
     Raises ConfigError for another type, shape or scale.
     """

@@ -1,7 +1,7 @@
 """A recorded person: a sound file as a voice, a face track as a sight.
 
-A run lasts as long as its recording; in a longer one the recording starts again after one second of silence, the face
-with its voice.
+A run lasts as long as its recording. In a longer run the recording starts again after one second of silence, the face
+together with its voice.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _EPS_FRAMES = 1e-6
 
 
 class RecordedVoice(SourcePart):
-    """`ports.Voice` of a file that is read during the run. Silence follows its end.
+    """A `ports.Voice` of a file that is read during the run. Silence follows its end.
 
-    loop: start again instead, after a pause.
+    loop: start the file again after a pause instead.
 
     Attributes:
-        frames: how many there are; the last is filled up with silence.
+        frames: number of frames; the last is filled up with silence.
     """
 
     def __init__(self, audio: AudioFile, loop: bool = False) -> None:
@@ -42,12 +42,12 @@ class RecordedVoice(SourcePart):
         self.duration_s: float | None = self.frames * FRAME_S
 
     def take(self, index: int) -> Floats:
-        """Return the samples (640,) of any frame; in order is fastest."""
+        """Return the samples (640,) of any frame; reading in order is fastest."""
         known = self._ahead.pop(index, None)
         return self._frame(index) if known is None else known
 
     def upcoming(self, index: int) -> Floats:
-        """Return as `Spoken`; kept until it is taken."""
+        """Return the samples (640,) of a frame, which are kept until it is taken; see `Spoken`."""
         if index not in self._ahead:
             self._ahead[index] = self._frame(index)
         return self._ahead[index]
@@ -72,11 +72,12 @@ class RecordedVoice(SourcePart):
 
 
 class RecordedSight(SourcePart):
-    """`ports.Sight` of a face track, resampled to the ends of the frames. No face where the track has
-    none, and after its end.
+    """A `ports.Sight` of a face track, resampled to the ends of the frames.
+
+    It has no face where the track has none, and after the end of the track.
 
     Args:
-        frames: of the voice it belongs to, with which it starts again; None: it is on its own.
+        frames: number of frames of its voice, with which it starts again; None: it has no voice.
     """
 
     def __init__(self, track: Track, loop: bool, frames: int | None) -> None:
@@ -87,7 +88,7 @@ class RecordedSight(SourcePart):
         self.duration_s: float | None = len(self._faces) * FRAME_S
 
     def at(self, time_s: float) -> Sighting | None:
-        """Return the face of the frame that ends at `time_s`, or ended last before it."""
+        """Return the face of the frame that ends at `time_s`, or of the last one that ended before."""
         index = math.floor(time_s * FRAME_HZ + _EPS_FRAMES) - 1
         place = index % (self._frames + _PAUSE_FRAMES) if self._loop else index
         if not 0 <= place < len(self._faces) or not np.isfinite(self._faces[place]).all():

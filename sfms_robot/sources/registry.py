@@ -1,8 +1,8 @@
-"""Values of `--audio`, `--face` and `--agent-audio`: a kind by name with its argument, a file, a shipped speaker.
+"""Values of `--audio`, `--face` and `--agent-audio`: the name of a kind with its argument, a file, a shipped speaker.
 
-A kind of another package is an entry point of the group `sfms_robot.sources`: a callable that takes the text behind the
-colon (NAME:ARGUMENT) and returns a `ports.Voice`, a `ports.Sight`, or, for `--audio`, a whole `ports.Source`. Kinds are
-imported when they are opened, so that a wrong name is found at once. Any voice goes with any face.
+A kind of another package is an entry point of the group `sfms_robot.sources`: a callable that accepts the text after
+the colon (NAME:ARGUMENT) and returns a `ports.Voice`, a `ports.Sight`, or, for `--audio`, a whole `ports.Source`. Kinds
+are imported only when they are opened, so that a wrong name is found at once. Any voice can be used with any face.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sfms_robot.errors import ConfigError
 from sfms_robot.network import LOCAL, Router
 from sfms_robot.plugins import plug_in, plugins, shipped
 
-if TYPE_CHECKING:  # numpy, which a look at a name does not need
+if TYPE_CHECKING:  # these import numpy, which the check of a name does not need
     from sfms_robot.ports import Source
     from sfms_robot.sources.net_person import PageVisitor
     from sfms_robot.sources.push import Spoken
@@ -28,7 +28,7 @@ if TYPE_CHECKING:  # numpy, which a look at a name does not need
 GROUP: Final = "sfms_robot.sources"
 DEFAULT_SPEAKER: Final = "facegood_1114_3_16"
 BROWSER: Final = "browser"  # the kind of a person in front of the page
-# The method that a part has, and its name in errors.
+# By flag: the methods that identify a part, and the name of such a part in errors.
 _PARTS: Final[Mapping[str, Mapping[str, str]]] = {
     "--audio": {"take": "voice", "read": "source"},
     "--face": {"at": "face"},
@@ -52,12 +52,12 @@ KINDS: Final[Mapping[str, Kinds]] = {
 
 
 def source_kinds(flag: str) -> Kinds:
-    """Return every kind of a flag by name, not yet imported; shipped kinds go before those of other packages."""
+    """Return every kind of a flag by name, not yet imported; shipped kinds take precedence over other packages'."""
     return KINDS[flag] if flag == "--agent-audio" else {**plugins(GROUP), **KINDS[flag]}
 
 
 def split_kind(value: str) -> tuple[str, str]:
-    """Return the kind's name and its argument of the value of a flag: `live-link,flip=yaw` has one without a colon."""
+    """Split the value of a flag into the kind and its argument, which may lack a colon, as in `live-link,flip=yaw`."""
     end = min((value.index(mark) for mark in ":," if mark in value), default=len(value))
     return value[:end], value[end:].removeprefix(":")
 
@@ -71,29 +71,29 @@ class ShippedSpeaker:
 
 
 def shipped_speaker(name: str) -> ShippedSpeaker:
-    """Return a shipped speaker by one of `data.speaker_names`."""
+    """Return the shipped speaker `name`, one of `data.speaker_names`."""
     folder = data_dir("sim") / "speakers" / name
     face = folder / "face.csv.gz"
     return ShippedSpeaker(folder / SPEAKER_VOICE, face if face.is_file() else None)
 
 
 def voice_file(name: str) -> Path | None:
-    """Return a sound file by path, or a speaker's by name; None when there is neither."""
+    """Return the sound file with this path, or the sound file of the speaker with this name; None if neither exists."""
     speaker = _speaker(name)
     return _existing(name) if speaker is None else speaker.audio
 
 
 def _speaker(name: str) -> ShippedSpeaker | None:
-    """Return a shipped speaker, unless a file has that name."""
+    """Return the shipped speaker `name`; None if there is none, or if a file has that name."""
     return shipped_speaker(name) if name in speaker_names() and not Path(name).is_file() else None
 
 
 def check_source(
     audio: str = "default", face: str = "auto", agent_audio: str = "none", play: str | None = None
 ) -> None:
-    """Check that there are such kinds, or such files, and something to play. Imports and opens nothing.
+    """Check that the kinds or files exist, and that `play` has a voice to play. Imports and opens nothing.
 
-    Raises ConfigError with the choices.
+    Raises ConfigError with the valid choices.
     """
     speakers = speaker_names()
     for flag, value, file, files in (
@@ -123,17 +123,17 @@ def open_source(
 ) -> Source:
     """Open a person by the flags of a run.
 
-    An audio `default` is `DEFAULT_SPEAKER`, or no voice when a face is named. A face `auto` is the shipped speaker's
-    own, else none. What the robot says is taken out of what a microphone hears.
+    The audio `default` is `DEFAULT_SPEAKER`, or no voice if a face is named. The face `auto` is the shipped speaker's
+    own face, else none. The robot's voice is removed from the sound of a microphone.
 
     Args:
-        loop: recordings start again when they end before `duration_s` does.
-        agent: what the robot says, instead of `agent_audio`.
-        play: the device that plays it; None: it is played elsewhere.
-        visitor: the person in front of the page, where one is served.
-        router: of ROS 2.
+        loop: True: recordings start again when they end before `duration_s`.
+        agent: the robot's voice, instead of `agent_audio`.
+        play: the device that plays the robot's voice; None: it is played elsewhere.
+        visitor: the person in front of the page, if a page is served.
+        router: the router of ROS 2.
 
-    Raises ConfigError for what is not there and cannot be used; what a kind raises when it is opened.
+    Raises ConfigError for a part that does not exist or cannot be used, and the errors of a kind when it is opened.
     """
     from sfms_robot.sources.paired import JudgedSource, PairedSource
 
@@ -141,7 +141,7 @@ def open_source(
     if audio == "default":
         audio = DEFAULT_SPEAKER if face in ("auto", "none") else "none"
     again = loop and duration_s is not None
-    with ExitStack() as failed:  # closes what was opened before the one that cannot be
+    with ExitStack() as failed:  # closes the parts already opened if another one fails
         opened = partial(_opened, failed)
         voice: Any
         own: Any = agent
@@ -172,7 +172,7 @@ def open_source(
 
 
 def _opened(failed: ExitStack, flag: str, value: str, **more: Any) -> Any:
-    """Open a kind; None where `value` names none. `more`: by kind, what its callable takes besides its argument."""
+    """Open a kind; None if `value` names none. `more`: a further argument of a kind's callable, by kind."""
     name, argument = split_kind(value)
     kind = source_kinds(flag).get(name)
     if kind is None:

@@ -1,9 +1,9 @@
-"""A person in a graph of ROS 2, without ROS installed: `--audio ros2:TOPIC`, `--face ros2:FACE_ID`.
+"""A person's voice and face from topics of ROS 2, without ROS installed: `--audio ros2:TOPIC`, `--face ros2:FACE_ID`.
 
-TOPIC carries `audio_common_msgs/AudioDataStamped`: 16-bit little-endian samples, which have no rate of their own (16
-kHz and one channel, or `,rate=48000,channels=2`). A face is `/humans/faces/FACE_ID/facs` (REP 155), or a whole topic,
-of `hri_msgs/FacialActionUnits`: intensities of 0 to 1, of units whose confidence is above 0. `,domain=N` is the domain,
-else ROS_DOMAIN_ID, else 0. Messages count from their arrival: the clocks of the machines may differ.
+TOPIC carries `audio_common_msgs/AudioDataStamped`: 16-bit little-endian samples without a rate (16 kHz and one channel,
+or `,rate=48000,channels=2`). A face is the topic `/humans/faces/FACE_ID/facs` (REP 155), or a topic given in full, of
+`hri_msgs/FacialActionUnits`: intensities of 0 to 1 of the units whose confidence is above 0. The domain is `,domain=N`,
+else ROS_DOMAIN_ID, else 0. A message's time is its arrival, because the clocks of the machines may differ.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from sfms_robot.sources.push import PushedVoice
 
 logger = logging.getLogger(__name__)
 
-SILENT_S: Final = 1.0  # a voice that is away for so long is lost: publishers send silence too
+SILENT_S: Final = 1.0  # a voice without messages for this long is lost: publishers send silence too
 MOST_CHANNELS: Final = 8
-_FILES: Final = (b"RIFF", b"ID3", b"OggS", b"fLaC")  # begin sound files
+_FILES: Final = (b"RIFF", b"ID3", b"OggS", b"fLaC")  # first bytes of sound files
 
 
 class _Subscriber(SourcePart):
-    """A part that takes the messages of one topic: whether they have stopped, and a line where none came."""
+    """A part that receives the messages of one topic, detects that they stopped, and logs a line if none came."""
 
     _flag: ClassVar[str]
     _counted = 0
@@ -43,7 +43,7 @@ class _Subscriber(SourcePart):
     def _subscribe(
         self, topic: str, domain: str, router: Router, *, kind: str, take: Callable[[Message], None]
     ) -> None:
-        """Hand each message of `topic` to `take`. Raises ConfigError."""
+        """Call `take` with each message of `topic`. Raises ConfigError."""
         self._topic = ros_topic(topic, self._flag)
         self._node = Ros2Node(
             f"sfms_robot_{self._flag.split()[0].strip('-')}",
@@ -54,14 +54,14 @@ class _Subscriber(SourcePart):
         )
 
     def statistics(self) -> Facts:
-        """Return the node's counts of messages, and those of what they become."""
+        """Return the node's counts of messages, and the statistics of the voice or face."""
         return {**super().statistics(), **self._node.counts}
 
     def close(self) -> None:
         self._node.close()
 
     def _look(self, time_s: float, after_s: float) -> None:
-        """Note whether messages came before loop time `time_s`, and have stopped for `after_s`."""
+        """Update `lost`: whether messages came before loop time `time_s` and have stopped for `after_s`."""
         counted = self._node.counts["received"] - self._node.counts["refused"]
         if counted > self._counted:
             self._counted, self._heard_s = counted, time_s

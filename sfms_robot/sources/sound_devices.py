@@ -1,7 +1,7 @@
-"""Sound devices, that record or that play: what PortAudio lists, and what a sound server has by the server's own names.
+"""Sound devices for recording and playback: those of PortAudio, and a sound server's own by the server's names.
 
-PulseAudio and PipeWire are one device to PortAudio ("pulse"). Which of their sources and sinks it opens are the
-environment variables PULSE_SOURCE and PULSE_SINK at that moment; monitors, what a loudspeaker is given, are sources.
+PulseAudio and PipeWire appear in PortAudio as one device ("pulse"). The environment variables PULSE_SOURCE and
+PULSE_SINK select the source or sink that it opens. Monitors, which record the signal of a loudspeaker, are sources.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from sfms_robot.sources.live_voice import LiveVoice, Pace
 from sfms_robot.sources.worker import SourceWorker
 
 _SERVER: Final = "pulse"  # PortAudio's name for the device of a sound server
-_HARDWARE: Final = re.compile(r" *\(hw:\d+(,\d+)?\)$")  # numbers that change when something is plugged in
+_HARDWARE: Final = re.compile(r" *\(hw:\d+(,\d+)?\)$")  # hardware numbers, which change when a device is plugged in
 _PACTL_LIMIT_S: Final = 5.0
 BLOCK_S: Final = 0.01
-_OLDEST_S: Final = 1.0  # a time stamp that is further away is of another clock
-_DENORMAL: Final = np.finfo(np.float32).tiny  # what is smaller costs four times the processor
+_OLDEST_S: Final = 1.0  # an older time stamp comes from another clock
+_DENORMAL: Final = np.finfo(np.float32).tiny  # smaller values take four times the processor time
 STEREO: Final = 2
-_STARTS: Final = 20  # a stream of ALSA's plugin for sound servers may never start: it is opened again
+_STARTS: Final = 20  # attempts to open a device: a stream of ALSA's plugin for sound servers may never start
 
 
 @dataclass(frozen=True, kw_only=True)
 class SoundDevice:
-    """A device that records, or one that plays.
+    """A device that records or plays sound.
 
     Attributes:
-        name: as PortAudio or the sound server calls it.
-        number: of PortAudio; another one when something was plugged in.
-        channels: at most.
-        rate_hz: that it has without being asked for another.
-        default: the one that is taken where none is named.
-        plays: it plays; else it records.
-        of_server: a source or a sink of the sound server, not a device of PortAudio's own.
+        name: its name in PortAudio or the sound server.
+        number: its number in PortAudio; it may change when a device is plugged in.
+        channels: highest number of channels.
+        rate_hz: default sample rate.
+        default: True for the device that is used if none is named.
+        plays: True if it plays, False if it records.
+        of_server: True for a source or sink of the sound server, False for a device of PortAudio itself.
     """
 
     name: str
@@ -60,28 +60,28 @@ class SoundDevice:
 
     @property
     def label(self) -> str:
-        """Text by which a person names it, number first where it has one."""
+        """Name of the device for the user, after its number if it has one."""
         return self.name if self.of_server else f"{self.number} {self.name}"
 
     @property
     def monitor(self) -> bool:
-        """It records what a loudspeaker is given."""
+        """True if it records the signal of a loudspeaker."""
         return self.of_server and not self.plays and self.name.endswith(".monitor")
 
     def selected(self) -> AbstractContextManager[None]:
-        """Let what is opened inside by `number` be this device. Not for several threads."""
+        """Select this device for streams that are opened by `number` in the context. Not for several threads."""
         variable = "PULSE_SINK" if self.plays else "PULSE_SOURCE"
         return environment({variable: self.name} if self.of_server else {})
 
 
 class DeviceStream:
-    """A stream of PortAudio's on one device. Base of what records and of what plays.
+    """A PortAudio stream on one device. Base class of streams that record and streams that play.
 
     Attributes:
-        plays: it plays; else it records.
-        wanted_latency_s: requested from the device.
-        start_limit_s: after so long without sound it counts as not started.
-        lost_s: after so long without a callback it went away.
+        plays: True if it plays, False if it records.
+        wanted_latency_s: latency requested from the device.
+        start_limit_s: time without sound after which the stream counts as not started.
+        lost_s: time without a callback after which the device counts as lost.
     """
 
     plays: ClassVar[bool]
@@ -97,10 +97,10 @@ class DeviceStream:
 
     @classmethod
     def opened(cls, wanted: str, flag: str) -> Self:
-        """Open the device that is wanted: at 16 kHz and mono where it takes that, else at its own rate.
+        """Open the device `wanted`: at 16 kHz and mono if it accepts that, else at its own rate.
 
-        Blocks until sound flows, some tenths of a second. Raises ConfigError for a device that is not there and without
-        PortAudio; PortError where there is none, and for one that cannot be opened.
+        Blocks until sound flows, some tenths of a second. Raises ConfigError for an unknown device or if PortAudio is
+        missing; PortError if the computer has no device, or if the device cannot be opened.
         """
         sounddevice = portaudio(flag)
         devices = listed_devices(flag, cls.plays)
@@ -119,7 +119,7 @@ class DeviceStream:
         raise PortError(f"{flag}: {device.name} is open, but {'takes' if cls.plays else 'gives'} no sound ({others})")
 
     def check(self) -> None:
-        """Raise PortError when the device went away."""
+        """Raise PortError if the device is lost."""
         if time.monotonic() - self._called_s > self.lost_s:
             raise PortError(f"{self.device.name} {'takes' if self.plays else 'gives'} no more sound")
 
@@ -131,7 +131,7 @@ class DeviceStream:
             self._stream = None
 
     def _start(self, stream: Any) -> bool:
-        """Open one of sounddevice's streams; return whether sound flows. Raises PortAudio's errors."""
+        """Open a stream, one of the classes of sounddevice; return whether sound flows. Raises PortAudio's errors."""
         with self.device.selected():
             self._stream = stream(
                 device=self.device.number,
@@ -149,7 +149,7 @@ class DeviceStream:
         return True
 
     def _called(self, samples: Floats, n: int, stamp: Any, status: Any) -> None:
-        """Take or give a block (n, channels), in a thread of PortAudio's."""
+        """Read or fill a block (n, channels), in a thread of PortAudio."""
         raise NotImplementedError
 
 
@@ -157,8 +157,8 @@ class Capture(DeviceStream):
     """A device that records into a queue.
 
     Attributes:
-        overflows: times that PortAudio lost samples.
-        pace: at which sound comes.
+        overflows: how often PortAudio lost samples.
+        pace: pace at which sound arrives.
     """
 
     plays = False
@@ -172,7 +172,7 @@ class Capture(DeviceStream):
         self._pieces = queue.SimpleQueue[tuple[Floats, float, bool]]()
 
     def pass_on(self, voice: LiveVoice, wait_s: float) -> None:
-        """Push all that was recorded to `voice`; wait so long for something. Raises PortError when it went away."""
+        """Push all recorded pieces to `voice`; wait `wait_s` for the first. Raises PortError if the device is lost."""
         with suppress(queue.Empty):
             while True:
                 samples, captured_s, overflow = self._pieces.get(wait_s > 0.0, wait_s)
@@ -186,7 +186,7 @@ class Capture(DeviceStream):
 
     @property
     def problem(self) -> str:
-        """Return what is wrong with its pace, in one line; empty without a fault."""
+        """Return the fault of the pace in one line, or an empty string."""
         if (rate := self.pace.off) is None:
             return ""
         return (
@@ -197,15 +197,15 @@ class Capture(DeviceStream):
     def _called(self, samples: Floats, n: int, stamp: Any, status: Any) -> None:
         now_s = self._called_s = time.monotonic()
         adc_age_s = stamp.currentTime - stamp.inputBufferAdcTime if stamp.inputBufferAdcTime else None
-        piece = np.where(np.abs(samples) < _DENORMAL, np.float32(0), samples)  # a copy: PortAudio writes there again
+        piece = np.where(np.abs(samples) < _DENORMAL, np.float32(0), samples)  # a copy: PortAudio reuses the array
         self._pieces.put((piece, captured_s(now_s, adc_age_s, n / self.rate_hz), bool(status.input_overflow)))
         self._flows.set()
 
 
 def captured_s(now_s: float, first_age_s: float | None, length_s: float) -> float:
-    """Return when the newest sample of a piece came, `time.monotonic`, never after `now_s`.
+    """Return the time of `time.monotonic` at which the newest sample of a piece was captured, never after `now_s`.
 
-    `first_age_s`: how old the device says that its first one is; None, or what cannot be: it came just now.
+    `first_age_s`: age of the first sample as the device reports it; for None or an impossible age, `now_s` is returned.
     """
     if first_age_s is None or not -length_s <= first_age_s <= _OLDEST_S:
         return now_s
@@ -213,7 +213,7 @@ def captured_s(now_s: float, first_age_s: float | None, length_s: float) -> floa
 
 
 def portaudio(flag: str) -> ModuleType:
-    """Return the module sounddevice, its library loaded. Raises ConfigError without it, for the option `flag`."""
+    """Return the module sounddevice. Raises ConfigError, which names the option `flag`, if PortAudio is missing."""
     try:
         import sounddevice
     except OSError as error:
@@ -223,9 +223,9 @@ def portaudio(flag: str) -> ModuleType:
 
 
 def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str, plays: bool = False) -> SoundDevice:
-    """Return the device with this number, this name, or the only one with this in its name; "" is the default one.
+    """Return the device with the number or name `wanted`, or the only one with it in its name; "": the default device.
 
-    Raises PortError where there are none, ConfigError for a name that is not there or fits several, with the choices.
+    Raises PortError if there are no devices, ConfigError with the choices if `wanted` fits none or several.
     """
     if not devices:
         choices = "leave it out" if plays else ", ".join(("FILE.wav", *speaker_names(), "none"))
@@ -240,9 +240,9 @@ def choose_device(devices: Sequence[SoundDevice], wanted: str, flag: str, plays:
 
 
 def accepted_format(device: SoundDevice, channels: Sequence[int], check: Callable[..., None]) -> tuple[float, int]:
-    """Return rate and channels that it takes: 16 kHz first, `channels` in their order; the last of all unchecked.
+    """Return the first rate and channel count that the device accepts: 16 kHz first, `channels` in their order.
 
-    `check`: sounddevice's, of what is recorded or of what is played.
+    The last combination is returned unchecked. `check`: sounddevice's check of input or output settings.
     """
     import sounddevice
 
@@ -258,14 +258,14 @@ def accepted_format(device: SoundDevice, channels: Sequence[int], check: Callabl
 
 
 def why_not_opened(error: Exception) -> str:
-    """Return PortAudio's message, or what it mostly means."""
+    """Return PortAudio's message, or the usual causes if the device is busy or unavailable."""
     text = str(error.args[0] if error.args else error).rpartition(": ")[2].partition(" [")[0]
     busy = "unavailable" in text.casefold() or "busy" in text.casefold()
     return "another program holds it, or it was unplugged" if busy else text
 
 
 def tell_devices(plays: bool) -> Generator[list[SoundDevice], Any, None]:
-    """Yield the devices of this moment; for a `SourceWorker`, since PortAudio prints what it likes."""
+    """Yield the present devices; runs in a `SourceWorker`, because PortAudio prints messages."""
     yield listed_devices("a loudspeaker" if plays else "a microphone", plays)
 
 
@@ -280,14 +280,14 @@ def sound_devices(plays: bool = False) -> list[SoundDevice]:
 
 
 def device_name(wanted: str, flag: str, plays: bool = False) -> str:
-    """Return the name of a device that is given by number: numbers change when something is plugged in."""
+    """Return `wanted`, or the name of a device given by number: numbers change when a device is plugged in."""
     return choose_device(sound_devices(plays), wanted, flag, plays).name if wanted.isdigit() else wanted
 
 
 def listed_devices(flag: str, plays: bool) -> list[SoundDevice]:
     """Return the devices that play, or those that record; blocks for some tenths of a second.
 
-    PortAudio sees the devices of the moment when it was loaded. Raises ConfigError without PortAudio.
+    PortAudio lists the devices that were present when it was loaded. Raises ConfigError without PortAudio.
     """
     sounddevice = portaudio(flag)
     channels = "max_output_channels" if plays else "max_input_channels"
@@ -322,7 +322,7 @@ def _fitting(devices: Sequence[SoundDevice], wanted: str) -> list[SoundDevice]:
 
 
 def _names_of_server(plays: bool) -> list[str]:
-    """Return names of its sinks, or its sources; none where its own tool is not installed, or does not answer."""
+    """Return the sound server's sinks or sources; none if its tool pactl is not installed, fails or does not answer."""
     words = ["pactl", "list", "short", "sinks" if plays else "sources"]
     try:
         listed = subprocess.run(words, capture_output=True, text=True, timeout=_PACTL_LIMIT_S, check=True)

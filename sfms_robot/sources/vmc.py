@@ -1,22 +1,22 @@
-"""Avatar software that speaks the VMC protocol (OSC over UDP): `--face vmc[:PORT|:HOST[:PORT]]`.
+"""Avatar software that sends the VMC protocol (OSC over UDP): `--face vmc[:PORT|:HOST[:PORT]]`.
 
-Read (protocol.vmc.info, "Marionette" specification), alone or in bundles:
+These messages are read (protocol.vmc.info, "Marionette" specification), alone or in bundles:
 
     /VMC/Ext/Blend/Val   name, value                 a blendshape: ARKit's 52 ("perfect sync"), or a preset of VRM
-    /VMC/Ext/Blend/Apply                             those since the last one hold now; without it a face is complete
+    /VMC/Ext/Blend/Apply                             apply the values since the last one; without it a face is complete
                                                      when the next begins (a bundle, or a name again), or after 100 ms
-    /VMC/Ext/Bone/Pos    name, position, quaternion  of bones "Head" and "Neck", each against its parent
+    /VMC/Ext/Bone/Pos    name, position, quaternion  of bones "Head" and "Neck", each relative to its parent
     /VMC/Ext/OK          loaded, ..., tracking       tracking 0: the face is lost
 
-Names go by any spelling that `signals.face_units.channel_of` knows. A sender whose ARKit shapes move is believed in
-these; the presets of another become the ARKit shapes nearest to them. Values above 1 are percent, where they stay so.
+Names may have any spelling that `signals.face_units.channel_of` accepts. If a sender's ARKit shapes move, they are
+used; the presets of other senders become the nearest ARKit shapes. Values that are often above 2 are percent.
 
-Unity's axes are left-handed, x right, y up, z forward as the avatar has them; a rotation about (x, y, z) there is one
-about (-z, x, -y) in ours. That follows from the two definitions; whether an avatar mirrors its person is a setting of
-its software, and not proved here: `flip=yaw+roll` undoes a mirror.
+Unity's axes are left-handed, x right, y up, z forward as seen from the avatar; a rotation about (x, y, z) there is one
+about (-z, x, -y) in ours. That follows from the two definitions. An avatar may mirror its person, depending on a
+setting of its software, and this is not checked here: `flip=yaw+roll` undoes a mirror.
 
-Messages are read here, in a third of python-osc's time, and bundles too: python-osc 1.10 does not return from one that
-gives a size of -4.
+Messages and bundles are parsed here, in a third of python-osc's time; python-osc 1.10 does not return from a bundle
+with a size of -4.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ _PRESETS: Final[Mapping[str, Mapping[str, float]]] = {
     "neutral": {},
 }  # fmt: skip
 _ARKIT: Final = len(BLENDSHAPES)
-_NAMES: Final = (*BLENDSHAPES, *_PRESETS)  # of the values
+_NAMES: Final = (*BLENDSHAPES, *_PRESETS)  # names of the values, in their order
 _AS_ARKIT: Final = np.array(
     [[preset.get(name, 0.0) for name in BLENDSHAPES] for preset in _PRESETS.values()], np.float32
 )
 
-_MOST_ELEMENTS: Final = 512  # of a packet
-_DEEPEST: Final = 4  # bundles in bundles
-_MOST_UNKNOWN: Final = 64  # names that are counted apart
-_UNIT_RANGE: Final = (0.9, 1.1)  # length of a quaternion that is one
-_FACE_S: Final = 0.1  # after so long a face without "Apply" is complete
+_MOST_ELEMENTS: Final = 512  # in a packet
+_DEEPEST: Final = 4  # levels of bundles in bundles
+_MOST_UNKNOWN: Final = 64  # unknown names that are kept and counted
+_UNIT_RANGE: Final = (0.9, 1.1)  # accepted length of a unit quaternion
+_FACE_S: Final = 0.1  # after this time a face without "Apply" is complete
 _MOST_VALUE: Final = 1000.0
 
 _NOTHING: Final = (
@@ -85,7 +85,7 @@ _READ: Final = frozenset((b"/VMC/Ext/Blend/Val", b"/VMC/Ext/Blend/Apply", b"/VMC
 
 
 def elements(data: bytes, depth: int = 0) -> Iterator[bytes]:
-    """Yield the messages of a packet, one or a bundle of them, in order. Raises PacketError for other bytes."""
+    """Yield the messages of a packet, one or a bundle of them, in order. Raises PacketError for other data."""
     if not data.startswith(_BUNDLE):
         if not data.startswith(b"/"):
             raise PacketError(foreign(data) or "no OSC packet")
@@ -93,7 +93,7 @@ def elements(data: bytes, depth: int = 0) -> Iterator[bytes]:
         return
     if depth == _DEEPEST:
         raise PacketError("bundles in bundles without end")
-    start = len(_BUNDLE) + 8  # the time tag
+    start = len(_BUNDLE) + 8  # skip the time tag
     while start < len(data):
         size = int.from_bytes(data[start : start + 4], "big", signed=True)
         start += 4
@@ -108,7 +108,7 @@ def elements(data: bytes, depth: int = 0) -> Iterator[bytes]:
 
 
 def _text(element: bytes, at: int) -> tuple[bytes, int]:
-    """Return a text of a message, and where the next value begins: texts are filled up to 4 bytes with zeros."""
+    """Return a text of a message and the start of the next value; texts are padded with zeros to 4 bytes."""
     end = element.find(b"\0", at)
     if end < 0:
         raise PacketError("an OSC message that is cut off")
@@ -116,7 +116,7 @@ def _text(element: bytes, at: int) -> tuple[bytes, int]:
 
 
 def arguments(element: bytes, at: int) -> list[Any]:
-    """Return the numbers, texts and booleans of a message, whose types begin at `at`. Raises PacketError for others."""
+    """Return the numbers, texts and booleans of a message whose types begin at `at`. Raises PacketError for others."""
     values: list[Any] = []
     if at >= len(element):
         return values
@@ -138,7 +138,7 @@ def arguments(element: bytes, at: int) -> list[Any]:
 
 @lru_cache(maxsize=64)
 def _layout(types: bytes) -> list[struct.Struct | bool | None]:
-    """Return what follows the types of a message: runs of numbers, booleans (without bytes), texts (None)."""
+    """Return the layout of a message's values by their types: runs of numbers, booleans (no bytes), texts (None)."""
     if not re.fullmatch(rb",[sTFihfd]*", types):
         raise PacketError("an OSC message of types that are not read")
     alone = {"s": None, "T": True, "F": False}
@@ -147,7 +147,7 @@ def _layout(types: bytes) -> list[struct.Struct | bool | None]:
 
 
 def turn_of_unity(quaternion: Sequence[float]) -> Doubles:
-    """Return the rotation (3, 3) in our axes of a quaternion x, y, z, w of unit length in Unity's."""
+    """Return the rotation (3, 3) in our axes of a quaternion x, y, z, w of unit length in Unity's axes."""
     x, y, z, w = quaternion
     cross = np.array([[0.0, y, x], [-y, 0.0, z], [-x, -z, 0.0]])  # of (-z, x, -y)
     turn: Doubles = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
@@ -156,7 +156,7 @@ def turn_of_unity(quaternion: Sequence[float]) -> Doubles:
 
 @lru_cache(maxsize=1024)
 def _place(name: bytes) -> int | None:
-    """Return the place of a name among the values."""
+    """Return the index of a name among the values, or None."""
     text = name.decode("utf-8", "replace")
     preset, channel = text.lower().rpartition(".")[2], channel_of(text)
     found = preset if preset in _PRESETS else channel
@@ -164,7 +164,7 @@ def _place(name: bytes) -> int | None:
 
 
 class VmcDecoder(Decoder):
-    """`Decoder` of one avatar. A name that is not sent again keeps its value, as receivers of avatars have it."""
+    """`Decoder` of one avatar. A name that is not sent again keeps its value, as in other receivers of avatars."""
 
     def __init__(self) -> None:
         self._counts = dict.fromkeys(("messages", "wrong_messages", "lost_tracking"), 0)
@@ -173,10 +173,10 @@ class VmcDecoder(Decoder):
     def restart(self) -> None:
         self._unknown = set[bytes]()
         self._values = [0.0] * len(_NAMES)
-        self._known = set[int]()  # places
+        self._known = set[int]()  # places received so far
         self._pending = set[int]()  # places whose values are not applied yet
-        self._pending_s = 0.0  # since when
-        self._applies = False  # the sender says when a face is complete
+        self._pending_s = 0.0  # time since which values are pending
+        self._applies = False  # True: the sender marks complete faces by "Apply"
         self._turned = False
         self._shapes: Floats = np.zeros(_ARKIT, dtype=np.float32)
         self._has_arkit = False
@@ -218,11 +218,11 @@ class VmcDecoder(Decoder):
         return used_line(moved, [name.decode("utf-8", "replace") for name in self._unknown]) if self._unknown else None
 
     def statistics(self) -> Facts:
-        """Return counts of messages, those of unexpected types, losses of tracking, and unknown names."""
+        """Return counts of messages, messages with unexpected types, losses of tracking, and unknown names."""
         return {**self._counts, "unknown_names": len(self._unknown)}
 
     def _take(self, element: bytes) -> None:
-        """Take one message. Raises PacketError for one whose values are not those of its address."""
+        """Process one message. Raises PacketError for values that do not fit its address."""
         address, at = _text(element, 0)
         if address not in _READ:
             return
@@ -263,7 +263,7 @@ class VmcDecoder(Decoder):
     def _apply(self) -> None:
         self._pending.clear()
         if self._unknown and not self._known:
-            return  # nothing of it can be shown
+            return  # none of its values can be shown
         values = np.array(self._values, dtype=np.float32)
         self._shapes = values[:_ARKIT] if self._has_arkit else (values[_ARKIT:, None] * _AS_ARKIT).max(axis=0)
         self._changed = True
@@ -273,7 +273,7 @@ class VmcDecoder(Decoder):
         self.blind = not tracking
 
     def _face(self) -> Floats | None:
-        """Return what has changed since the last question."""
+        """Return the face (58,) if it has changed since the last call, else None."""
         changed, self._changed = self._changed, False
         if not changed or self.blind:
             return None
@@ -288,7 +288,7 @@ def _is_number(value: object) -> bool:
 
 
 def open_vmc(argument: str) -> UdpSight:
-    """Open `--face vmc[:PORT|HOST[:PORT]][,flip=...]`; without HOST only avatar software on this machine can send.
+    """Open `--face vmc[:PORT|HOST[:PORT]][,flip=...]`; without HOST only software on this machine can send.
 
     Raises as `UdpSight`.
     """
@@ -296,7 +296,7 @@ def open_vmc(argument: str) -> UdpSight:
 
 
 def _hint(host: str, port: int, wider: str) -> str:
-    """Return what to do so that packets of avatar software arrive."""
+    """Return instructions for making packets of avatar software arrive."""
     own = addresses_of_this_machine() if host in ANY else [host]
     target = f"let the avatar software send VMC to {' or '.join(own) or 'this machine'}, port {port}"
     return f"{target}; {wider} also takes packets of other machines" if wider else target

@@ -1,10 +1,10 @@
 """A person's face from a webcam: `--face webcam[:N|FILE][,flip=...]`.
 
-Camera and MediaPipe are in a process of their own (`watch`), which is started again when the camera goes away. No
-picture is kept, none leaves that process. MediaPipe (extra `webcam`) finds up to three faces in each picture; the
-person among them is chosen here (`choose`). A picture's time is when the driver says that it was taken, where it does
-so on this computer's clock, else when it arrived. A recorded video is played at its own pace from loop time 0 on; what
-cannot be kept up with is left out. Without a face in the picture nothing new is reported: the last one ages.
+Camera and MediaPipe run in a separate process (`watch`), which is started again when the camera is lost. No picture is
+kept, and none leaves that process. MediaPipe (extra `webcam`) finds up to three faces in each picture; the person among
+them is chosen here (`choose`). A picture's time is the driver's time stamp if that is on this computer's clock, else
+its arrival. A recorded video is played at its own pace from loop time 0 on; late pictures are left out. A picture
+without a face reports no new face: the last one ages.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ from sfms_robot.signals.rotations import FROM_CAMERA, camera_angles
 from sfms_robot.sources.live_face import LiveFace, parse_face_argument
 from sfms_robot.sources.worker import SourceWorker
 
-_NICE: Final = 5  # below the servo loop
+_NICE: Final = 5  # lower priority than the servo loop
 MOST_FACES: Final = 3
-_PICTURE_PX: Final = (640, 480)  # asked of a camera; more shows nothing new of a face at arm's length
-_DARK: Final = 16  # mean of 0..255: a lens that is covered, a room without light
-_OLDEST_S: Final = 0.5  # a driver's time stamp that is further away is of another clock
+_PICTURE_PX: Final = (640, 480)  # requested from a camera; a larger picture adds nothing to a face at arm's length
+_DARK: Final = 16  # mean of 0..255 below which the lens is covered or the room has no light
+_OLDEST_S: Final = 0.5  # an older time stamp of a driver comes from another clock
 _ALIVE_S: Final = 0.02
-# Between the eyes, in the axes and centimetres of the matrix: mean of the corners of both eyes (points 33, 133, 362 and
-# 263) in `canonical_face_model.obj` of google-ai-edge/mediapipe.
+# Point between the eyes, in the axes and centimetres of the matrix: mean of the corners of both eyes (points 33, 133,
+# 362 and 263) in `canonical_face_model.obj` of google-ai-edge/mediapipe.
 _EYES_CM: Final = (0.0, 2.62, 3.47, 1.0)
 
 
-NEARER: Final = 0.8  # of the chosen one's distance: clearly nearer
-TAKE_OVER_S: Final = 1.0  # for so long, without a break
-GONE_S: Final = 0.5  # one that has not been seen for so long is gone
-STEP: Final = 0.25  # of its distance: no further away from where it was can a face be the same one
+NEARER: Final = 0.8  # share of the chosen face's distance below which another face is clearly nearer
+TAKE_OVER_S: Final = 1.0  # time without a break for which another face has to be clearly nearer
+GONE_S: Final = 0.5  # a face that has not been seen for this long is gone
+STEP: Final = 0.25  # largest move of a face from one picture to the next, as a share of its distance
 
 Picture = NDArray[np.uint8]  # (H, W, 3) red, green, blue
 
@@ -55,8 +55,8 @@ class SeenFace:
     """One face in one picture.
 
     Attributes:
-        motion: (58,) pose in the person's axes (x forward, from the lens on, so negative), blendshapes.
-        place_m: (3,) between the eyes, from the camera: x out of its lens, y to its left, z up.
+        motion: (58,) pose in the person's axes (x forward, measured from the lens, so negative), blendshapes.
+        place_m: (3,) point between the eyes in the camera's frame: x out of its lens, y to its left, z up.
     """
 
     motion: Floats
@@ -65,20 +65,20 @@ class SeenFace:
 
 @dataclass(frozen=True)
 class WebcamOpened:
-    """The first message. `duration_s`: of a recorded video; None for a camera."""
+    """The first message of `watch`. `duration_s`: length of a recorded video; None for a camera."""
 
     duration_s: float | None
 
 
 @dataclass(frozen=True, kw_only=True)
 class SeenPicture:
-    """One picture.
+    """The faces found in one picture.
 
     Attributes:
-        taken_s, known_s: when it was taken, and when its face was known; `time.monotonic`.
-        face: of the person, or None.
-        others: faces besides.
-        dark: the picture was black.
+        taken_s, known_s: times of `time.monotonic` at which it was taken and its face was known.
+        face: face of the person, or None.
+        others: number of other faces.
+        dark: True if the picture was black.
     """
 
     taken_s: float
@@ -111,7 +111,7 @@ class Landmarker:
 
     def faces(self, picture: Picture, taken_s: float) -> list[SeenFace]:
         """Return the faces in the next picture of the stream."""
-        self._last_ms = max(self._last_ms + 1, round(taken_s * 1e3))  # it refuses a time that does not grow
+        self._last_ms = max(self._last_ms + 1, round(taken_s * 1e3))  # MediaPipe requires increasing times
         image = self._mediapipe.Image(image_format=self._mediapipe.ImageFormat.SRGB, data=picture)
         found = self._landmarker.detect_for_video(image, self._last_ms)
         return [
@@ -124,10 +124,10 @@ class Landmarker:
 
 
 def watch(argument: str) -> Generator[WebcamOpened | SeenPicture | None, float | None, None]:
-    """Watch a camera (its number) or a recorded video (its file); see `sources.worker`.
+    """Watch a camera (`argument` is its number) or a recorded video (its file); see `sources.worker`.
 
-    Faces are found once loop time 0 is known, at which a video begins. Raises MissingExtra,
-    ConfigError for another file, PortError for a camera that cannot be opened or that goes away.
+    Detection begins when loop time 0 is known, at which a video begins. Raises MissingExtra, ConfigError for a file
+    that is not a video, PortError for a camera that cannot be opened or that is lost.
     """
     need_extra()
     video = None if argument.isdigit() else argument
@@ -155,7 +155,7 @@ def watch(argument: str) -> Generator[WebcamOpened | SeenPicture | None, float |
 
 
 def need_extra() -> None:
-    """Raise MissingExtra without MediaPipe."""
+    """Raise MissingExtra if MediaPipe is not installed."""
     with optional("--face webcam"):
         if importlib.util.find_spec("mediapipe") is None:
             raise ModuleNotFoundError(name="mediapipe")
@@ -170,12 +170,12 @@ def open_camera(number: int) -> Any:
         raise PortError(f"--face webcam: no camera {number} ({_why_not(number)})")
     for key, value in zip((cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT), _PICTURE_PX, strict=True):
         capture.set(key, value)
-    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # old pictures are of no use
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # old pictures are useless
     return capture
 
 
 def open_video(file: str) -> Any:
-    """Open a recorded video. Raises ConfigError for another file."""
+    """Open a recorded video. Raises ConfigError for a file that is not a video."""
     import cv2
 
     capture = cv2.VideoCapture(file)
@@ -185,7 +185,7 @@ def open_video(file: str) -> Any:
 
 
 def live(capture: Any, name: str) -> Iterator[tuple[float, Picture]]:
-    """Yield pictures of a camera and when they were taken. Raises PortError when it goes away."""
+    """Yield the times at which pictures of a camera were taken, and the pictures. Raises PortError if it is lost."""
     import cv2
 
     while True:
@@ -199,7 +199,7 @@ def live(capture: Any, name: str) -> Iterator[tuple[float, Picture]]:
 
 
 def played(capture: Any, begins_s: float) -> Iterator[tuple[float, Picture | None]]:
-    """Yield pictures of a video at their own pace, without late ones; None while the next one is to come."""
+    """Yield the times and pictures of a video at its own pace, without late ones; None while waiting for the next."""
     import cv2
 
     period_s = 1.0 / capture.get(cv2.CAP_PROP_FPS)
@@ -217,7 +217,7 @@ def played(capture: Any, begins_s: float) -> Iterator[tuple[float, Picture | Non
 
 
 def _duration_s(capture: Any) -> float | None:
-    """Return the length of a video; None where the file does not say."""
+    """Return the length of a video; None if the file does not contain it."""
     import cv2
 
     pictures = float(capture.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -225,7 +225,7 @@ def _duration_s(capture: Any) -> float | None:
 
 
 def _why_not(number: int) -> str:
-    """Return why a camera cannot be opened; Linux has device files."""
+    """Return the likely reason why a camera cannot be opened, from the device files of Linux."""
     device = Path(f"/dev/video{number}")
     if device.exists():
         if not os.access(device, os.R_OK | os.W_OK):
@@ -237,17 +237,18 @@ def _why_not(number: int) -> str:
 
 # --- one face in the units of this project ------------------------------------------------------------------------
 #
-# MediaPipe gives 52 blendshapes by name, `_neutral` among them and `tongueOut` not, left and right the person's own in
-# a picture that is not mirrored, and a matrix face -> camera: x to the picture's right, y up, z towards the viewer,
-# centimetres. With x forward = z, y left = x, z up = y its rotation is our Rz(yaw) Ry(pitch) Rx(roll), signs included.
+# MediaPipe returns 52 blendshapes by name, with `_neutral` and without `tongueOut`; left and right are the person's own
+# in a picture that is not mirrored. It also returns a matrix face -> camera: x to the picture's right, y up, z towards
+# the viewer, centimetres. With x forward = z, y left = x, z up = y its rotation is our Rz(yaw) Ry(pitch) Rx(roll),
+# signs included.
 #
-# The distance is what a lens of 63 degrees across the picture's height would make of the face's size, and the face is
-# taken to be of average size. So it is relative: a lens of 45 degrees makes people come out about a third too near.
-# Sideways and up are not affected, since there the lens cancels out.
+# The distance is computed from the face's size for a lens of 63 degrees across the picture's height and a face of
+# average size. So it is relative: with a lens of 45 degrees people seem about a third too near. Sideways and up are not
+# affected, because there the lens cancels out.
 
 
 def seen_face(matrix: Reals, shapes: Mapping[str, float]) -> SeenFace:
-    """Return a face of its `matrix` (4, 4) face -> camera; `shapes` by MediaPipe's names, 0 where missing."""
+    """Return a face from its `matrix` (4, 4) face -> camera and its `shapes` by MediaPipe's names, 0 if missing."""
     pose = (*camera_angles(matrix), *matrix[FROM_CAMERA, 3] / 100.0)
     eyes_m = (matrix @ np.array(_EYES_CM))[:3] / 100.0
     return SeenFace(
@@ -258,14 +259,14 @@ def seen_face(matrix: Reals, shapes: Mapping[str, float]) -> SeenFace:
 
 # --- which of several faces is the person -------------------------------------------------------------------------
 #
-# The nearest, and not another one at every breath. A face that was chosen stays chosen while it is seen. Another takes
-# its place only when it has been clearly nearer for a while, or when the chosen one is gone. A face is recognized by
-# its place: it does not jump between two pictures.
+# The nearest face is the person, but the choice must not change with every small movement. A chosen face stays chosen
+# while it is seen. Another face takes its place only when it has been clearly nearer for a while, or when the chosen
+# one is gone. A face is recognized by its place, because it does not jump between two pictures.
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The person chosen so far: where and when they were last seen, and since when another one is clearly nearer."""
+    """The person chosen so far: place and time when last seen, and since when another face is clearly nearer."""
 
     place_m: Floats
     seen_s: float
@@ -273,7 +274,7 @@ class Choice:
 
 
 def choose(places_m: Sequence[Floats], time_s: float, before: Choice | None) -> tuple[int | None, Choice | None]:
-    """Return the index of the person among the faces of a picture, by place (3,) from the camera; None without one.
+    """Return the index of the person among faces at places (3,) from the camera, None without one; and the choice.
 
     `before`: the choice of the last picture, None at first. The order of the faces does not matter.
     """
@@ -295,7 +296,7 @@ def choose(places_m: Sequence[Floats], time_s: float, before: Choice | None) -> 
 
 
 def _same(places_m: Sequence[Floats], before: Choice | None) -> int | None:
-    """Return the face that is where the chosen one was, or None."""
+    """Return the index of the face at the place of the chosen one, or None."""
     if before is None or not places_m:
         return None
     steps_m = [float(np.linalg.norm(place - before.place_m)) for place in places_m]
@@ -307,11 +308,11 @@ def _same(places_m: Sequence[Floats], before: Choice | None) -> int | None:
 
 
 class Webcam(LiveFace):
-    """`ports.Sight` of the worker `watch`. Only `close` blocks.
+    """A `ports.Sight` of the faces from the worker `watch`. Only `close` blocks.
 
     Attributes:
-        lost: the camera is away, or its process.
-        latency_s: median from a picture taken to its face known; 0 before the first picture.
+        lost: True while the camera or its process is lost.
+        latency_s: median time from taking a picture to knowing its face; 0 before the first picture.
     """
 
     def __init__(self, worker: SourceWorker, signs: Floats, duration_s: float | None) -> None:
@@ -336,7 +337,7 @@ class Webcam(LiveFace):
         return super().at(time_s)
 
     def statistics(self) -> Facts:
-        """Return the state of the worker; counts of pictures, without a face, dark, with other people; latency."""
+        """Return the worker's state, the latency, and counts of pictures: all, without a face, dark, with others."""
         return {**self._worker.statistics(), **self._counts, "latency_ms": self._latency_ms.report(p50=50, p99=99)}
 
     def close(self) -> None:
@@ -358,8 +359,9 @@ class Webcam(LiveFace):
 def open_webcam(argument: str) -> Webcam:
     """Open `--face webcam[:N|FILE]`: a camera's number (default 0) or a recorded video.
 
-    Blocks until it is open and MediaPipe is loaded, a few seconds. Raises ConfigError for what is neither, for another
-    file and (MissingExtra) without the extra `webcam`; PortError for a camera that cannot be opened.
+    Blocks until it is open and MediaPipe is loaded, a few seconds. Raises ConfigError for an argument that is neither,
+    for a file that is not a video and (MissingExtra) without the extra `webcam`; PortError for a camera that cannot be
+    opened.
     """
     place, signs = parse_face_argument("webcam", argument)
     if not place.isdigit() and place and not Path(place).is_file():

@@ -1,19 +1,19 @@
-"""A source in a child process: neither pictures nor drivers may hold up the servo loop.
+"""A source in a child process, so that image processing and device drivers cannot delay the servo loop.
 
 The child runs a generator function of a module that can be imported:
 
     def work(argument: Any) -> Generator[Any, Any, None]: ...
 
-What it yields is sent to the parent; `None` says only that it is alive. It stamps what it yields with `time.monotonic`,
-which is one clock for all processes. The result of a `yield` is the newest message of the parent, or None.
+Yielded values are sent to the parent; `None` is only a sign of life. Time stamps in the values are of `time.monotonic`,
+which is the same clock in all processes. The result of a `yield` is the newest message of the parent, or None.
 
-When it returns it is finished, and is not started again. When it raises, dies or sends nothing for too long, it is
-started again after a pause that grows (`processes.LIMITS["source"]`).
+A generator that returns is finished and is not started again. When it raises, dies or sends nothing for too long, it is
+started again after a pause that grows with each failure (`processes.LIMITS["source"]`).
 
     parent -> child    (work, argument, nice), then messages
     child -> parent    None, or (kind, value)
-        value          it yielded `value`
-        failed         it raised, and value is the RobotError that says why, or the name of another error
+        value          the generator yielded `value`
+        failed         it raised; `value` is the RobotError, or a text with the name and message of another error
         finished       it returned
 """
 
@@ -35,26 +35,26 @@ Work = Callable[[Any], Generator[Any, Any, None]]
 
 
 class SourceWorker:
-    """One generator in a child process that starts at once; see the module. Only `wait` and `close` block.
+    """A generator in a child process that starts at once; see the module docstring. Only `wait` and `close` block.
 
     Args:
-        name: in log lines and errors, such as "webcam 0".
+        name: used in log lines and errors, such as "webcam 0".
         work, argument: the generator function and its argument; both are pickled.
-        nice: by how much its process gives way to others, 0 to 19, where the system has that.
+        nice: increment of the process's niceness, 0 to 19, where the system supports it.
     """
 
     def __init__(self, name: str, work: Work, argument: Any, nice: int = 0) -> None:
         self._name, self._order = name, (work, argument, nice)
         self._sent: Any = None
         self._ended: str | None = None  # "finished" or "closed"
-        self._dropped = 0  # by children of before
-        self._first: list[Any] = []  # taken by `wait`
+        self._dropped = 0  # messages dropped by earlier children
+        self._first: list[Any] = []  # message received in `wait`, not yet returned by `messages`
         self._supervised = Supervised(name, LIMITS["source"], self._start)
 
     def wait(self, limit_s: float = START_LIMIT_S) -> None:
-        """Block until the worker has sent something.
+        """Block until the worker has sent a message.
 
-        Raises the RobotError that it raised instead; PortError when it broke, or sent nothing for `limit_s`.
+        Raises the RobotError that the worker raised; PortError if it failed otherwise or sent nothing for `limit_s`.
         """
         message = self._supervised.child.receive(limit_s)
         failure = f"nothing came for {limit_s:g} s" if message is None else _failure(message)
@@ -64,17 +64,17 @@ class SourceWorker:
         self._first.append(message)
 
     def tell(self, value: Any) -> None:
-        """Send a message, which the result of the next `yield` is, also in a worker that is started again.
+        """Send a message, which becomes the result of the worker's next `yield`; sent again to a restarted worker.
 
-        Never blocks: of messages that the worker has not read yet only the newest is kept.
+        Never blocks: of the messages that the worker has not read yet, only the newest is kept.
         """
         self._sent = value
         self._supervised.child.offer(value)
 
     def messages(self, now_s: float) -> list[Any]:
-        """Return what came, oldest first, `MOST_WAITING` at most; restart a worker that died or hangs.
+        """Return the received values, oldest first, at most `MOST_WAITING`; restart a worker that died or hangs.
 
-        `now_s` is that of `time.monotonic`. Never blocks, never raises.
+        `now_s` is a time of `time.monotonic`. Never blocks, never raises.
         """
         messages, self._first = self._first, []
         child = self._supervised.child
@@ -94,7 +94,7 @@ class SourceWorker:
 
     @property
     def lost(self) -> bool:
-        """Return whether it is away, or being started again."""
+        """Return whether the worker has failed, hangs or is being started again."""
         return self._ended is None and self._supervised.away
 
     def statistics(self) -> Facts:
@@ -107,7 +107,7 @@ class SourceWorker:
         }
 
     def close(self) -> None:
-        """End the worker; blocks for twice `CLOSE_LIMIT_S` at most. Idempotent."""
+        """End the worker. Blocks for at most twice `CLOSE_LIMIT_S`. Idempotent."""
         self._ended = "closed"
         self._supervised.child.close(CLOSE_LIMIT_S)
 
@@ -119,7 +119,7 @@ class SourceWorker:
 
 
 def _failure(message: Any) -> RobotError | str | None:
-    """Return what a message says went wrong; None if nothing did."""
+    """Return the failure that a message reports, or None."""
     if isinstance(message, Ended):
         return f"its process died (exit code {message.code})"
     return message[1] if message[0] == "failed" else None
@@ -129,7 +129,7 @@ def _failure(message: Any) -> RobotError | str | None:
 
 
 def main() -> None:
-    """Do the work that the first message names until it ends, or the pipe does."""
+    """Run the generator function of the first message until it returns or the pipe closes."""
     parent = ParentPipe()
     work, argument, nice = parent.receive()
     newest = deque[Any]([None], maxlen=1)
@@ -145,5 +145,5 @@ def main() -> None:
         parent.send(("finished", None))
     except RobotError as error:
         parent.send(("failed", error))
-    except Exception as error:  # of a library or a driver: reported by the parent, which starts the work again
+    except Exception as error:  # of a library or a driver: the parent reports it and starts the work again
         parent.send(("failed", f"{type(error).__name__}: {error}"))

@@ -24,12 +24,12 @@ from sfms_robot.viewer.page_server import PageServer
 from sfms_robot.viewer.web_server import WebLoop, listen_at, web_server
 
 SceneOf = Callable[[str, Sequence[str]], RobotScene | None]
-NICE: Final = 5  # the servo loop goes first
+NICE: Final = 5  # so that the servo loop runs first
 MOST_UNSENT: Final = 100  # pieces of voice and face for a run that does not read: older ones are left out
 
 
 class FromRun:
-    """Messages of the run, handled in the server's loop; of pictures that come together the newest is shown."""
+    """Messages of the run, handled in the server's loop; if several pictures wait, the newest is shown."""
 
     def __init__(self, page: PageServer, scene_of: SceneOf) -> None:
         self._page, self._scene_of = page, scene_of
@@ -37,7 +37,7 @@ class FromRun:
         self._waiting = deque[Any]()
 
     def put(self, message: Any) -> None:
-        """Take a message, in the thread that reads."""
+        """Queue a message; called in the thread that reads."""
         self._waiting.append(message)
         self._loop.call_soon_threadsafe(self._handle)
 
@@ -67,7 +67,7 @@ class FromRun:
 
 
 def main(scene_of: SceneOf = lambda *_: None) -> None:
-    """Serve until the pipe ends. `scene_of`: returns the picture of a head by its name."""
+    """Serve until the pipe ends. `scene_of`: function that returns the picture of a head by its name."""
     parent = ParentPipe()
     address = parent.receive()
     give_way(NICE)
@@ -79,7 +79,7 @@ async def _serve(address: Address, parent: ParentPipe, scene_of: SceneOf) -> Non
     writer = PipeWriter(parent.outgoing, MOST_UNSENT, "run")
 
     def send(visitor: int, content: Facts | bytes) -> None:
-        """Send a document, or a piece of a visitor's voice, or a face, without waiting."""
+        """Send a document, or a piece of a visitor's voice or face, without waiting."""
         (writer.offer if isinstance(content, bytes) else writer.send)(pickle.dumps((visitor, content)))
 
     try:

@@ -1,17 +1,17 @@
 """Messages of the page: pictures and documents to it, commands of its visitors. Opens no socket.
 
-A picture travels from the run's process to the page's packed, which takes microseconds; the page's process makes JSON
-of it, once for all visitors. What seldom changes (state, faults, hazards) is JSON that the run keeps until it changes.
+The run's process packs a picture, which takes microseconds, and sends it to the page's process, which makes JSON of it,
+once for all visitors. Values that seldom change (state, faults, hazards) are JSON that the run keeps until they change.
 
     float64   time [s]
     float32   level of the person's voice [dB], of the robot's own, attention, place x, y, z [m]; NaN: unknown
     uint8     whether the person talks; a byte of padding
     uint16    J, the number of joints
-    float32   motion (58,), joints asked (J,) [rad], joints read (J,) [rad, NaN: never]
+    float32   motion (58,), joints requested (J,) [rad], joints read (J,) [rad, NaN: never]
     rest      JSON of `s`, `w`, `f`, `h` without its braces
 
-Of a command only the form is judged here: keys, types, finite numbers. Names and ranges of a head are judged where the
-command is carried out.
+Only the form of a command is checked here: keys, types, finite numbers. Names and ranges of a head are checked where
+the command is carried out.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _HEADER: Final = struct.Struct("<d6f?xH")
 _DIGITS: Final = 4
 _LONGEST_TEXT: Final = 256
 
-# (J,) angles, read where a servo has answered and else asked [rad] -> values of the joints of a URDF.
+# (J,) angles [rad], read if a servo has answered, otherwise requested -> values of the joints of a URDF.
 Shown = Callable[[Doubles], Doubles]
 
 
@@ -66,7 +66,7 @@ def pack_picture(
     place_m: Sequence[float] | Floats | None = None,
     talking: bool = False,
 ) -> bytes:
-    """Pack what a page shows of one instant, as the module says.
+    """Pack the picture of one instant, in the format of the module's docstring.
 
     Args:
         motion: (58,). asked_rad, read_rad: (J,); NaN in the latter where a servo never answered.
@@ -93,7 +93,7 @@ def frame_json(record: bytes, shown: Shown | None = None) -> bytes:
         "j": asked_rad.round(_DIGITS),
         "r": read_rad.round(_DIGITS),
         "u": (there_rad if shown is None else shown(there_rad)).round(_DIGITS),
-        "db": round(voice_db, 1),  # unknown is NaN, of which JSON makes null; the same below
+        "db": round(voice_db, 1),  # unknown is NaN, which becomes null in JSON; the same below
         "talk": talking,
         "own": round(own_db, 1),
         "at": round(attention, _DIGITS),
@@ -121,7 +121,7 @@ _Whole = Annotated[int, Field(strict=True, ge=0, lt=2**32)]
 _Text = Annotated[str, Field(max_length=_LONGEST_TEXT), PRINTABLE]
 _Anything = Annotated[Any, AfterValidator(_short)]
 _Numbers = Annotated[dict[str, _Number], Field(max_length=128)]
-_Rates = Annotated[dict[str, _Number | None], Field(max_length=128)]  # None: as people do
+_Rates = Annotated[dict[str, _Number | None], Field(max_length=128)]  # None: the rate of people
 _Feeds = list[Literal["voice", "face"]]
 
 # The keys of each command, with their types and defaults (...: required).

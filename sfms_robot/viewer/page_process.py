@@ -1,10 +1,10 @@
-"""The page's server in a child process: visitors cost the servo loop no tick.
+"""The page's server in a child process, so that visitors never cost the servo loop a tick.
 
     run -> page     the `Address`; then bytes: a packed picture, or (visitor, JSON): a document, with visitor 0 for all
     page -> run     (visitor, dict): a document; (visitor, bytes): the voice or face of a visitor; a sign of life every
                     `BEAT_S`
 
-The run's side sends numbers and small documents. The child makes JSON of pictures, talks to visitors, and sends back
+The run's side sends numbers and small documents. The child makes JSON of pictures, serves visitors, and sends back
 their commands.
 """
 
@@ -37,7 +37,7 @@ class Address:
     """The address of the page: `--view [HOST:]PORT`, and the files of `--view-cert` and `--view-key` for https.
 
     Attributes:
-        port: 0 for any that is free; one that is taken makes room for the next that is free.
+        port: 0 for any free port; in place of a port that is taken, the next free one is used.
     """
 
     host: str = LOOPBACK
@@ -63,28 +63,26 @@ class Asked(Protocol):
     """The receiver of visitors' commands. Called in a thread of the page's; a RobotError is sent to the visitor."""
 
     def command(self, visitor: int, name: str, values: Report) -> None:
-        """Do what a visitor with the controls wants."""
+        """Carry out a command of the visitor with the controls."""
 
     def person(self, visitor: int, message: bytes) -> None:
-        """Take a piece of the voice, or a face, of the visitor with the controls: a message of
-        docs/reference/protocol.md.
-        """
+        """Receive a piece of voice, or a face, of the visitor with the controls, as in docs/reference/protocol.md."""
 
     def left(self, visitor: int) -> None:
-        """Note that the visitor with the controls has them no more."""
+        """Record that a visitor has lost the controls."""
 
 
 class PageProcess:
-    """The run's side. All methods from any thread; only `wait` and `close` block.
+    """The run's side of the page. All methods from any thread; only `wait` and `close` block.
 
     Args:
-        address: where to serve; the child starts at once, and `wait` raises what came of it.
-        child: what runs there, a "module:function".
+        address: address to serve at; the child starts at once, and `wait` raises its errors.
+        child: function that runs in the child, "module:function".
 
     Attributes:
-        url: where the page is, with its token where it needs one.
-        taken: port that was wanted and is used by another program; None where it was free.
-        visitors: how many look at it now.
+        url: address of the page, with its token if it needs one.
+        taken: port that was requested and is used by another program; None if it was free.
+        visitors: number of visitors now.
         visited: set once the number of visitors has changed.
     """
 
@@ -104,15 +102,15 @@ class PageProcess:
 
     @property
     def process_id(self) -> int:
-        """Return that of the server."""
+        """Return the id of the server's process."""
         return self._supervised.child.process.pid
 
     def __str__(self) -> str:
-        """Return where it is, for people."""
+        """Return the page's address, and the port that is taken, for people."""
         return self.url + ("" if self.taken is None else f" ({self.taken} is taken)")
 
     def wait(self) -> None:
-        """Block until it answers there. Raises PortError, ConfigError where it cannot."""
+        """Block until the page answers at its address. Raises PortError, ConfigError if it cannot."""
         if not self._bound.wait(START_LIMIT_S):
             self.close()
             raise PortError(f"--view: the page's process did not start within {START_LIMIT_S:g} s")
@@ -125,15 +123,15 @@ class PageProcess:
         self._asked = asked
 
     def watch(self, now_s: float) -> None:
-        """Report a server that hangs, once, and once when it is back. The run's loop calls it a few times a second."""
+        """Report once that the server hangs, and once that it is back. The run's loop calls it a few times a second."""
         self._supervised.check(now_s, self._supervised.child.gave_sign())
 
     def statistics(self) -> Report:
-        """Return for status and report: whether it hangs now, and how often it has."""
+        """Return, for status and report, whether the server hangs now, and how often it has."""
         return {"hung": self._supervised.hung, "hangs": self._supervised.hangs}
 
     def show(self, record: bytes) -> None:
-        """Send a packed picture; an older one that has not left yet is left out."""
+        """Send a packed picture; an older one that was not sent yet is left out."""
         self._supervised.child.offer(record)
 
     def keep(self, record: bytes) -> None:
@@ -145,8 +143,8 @@ class PageProcess:
         self._supervised.child.send((visitor, orjson.dumps({"do": do, **values}, default=str)))
 
     def later(self, task: Callable[[], None]) -> None:
-        """Do in a thread what takes longer than a tick has, such as putting a document together."""
-        self._tasks.submit(task).add_done_callback(lambda done: done.result())  # the log has what it raised
+        """Run a task in a thread, because it is too long for a tick, such as making a document."""
+        self._tasks.submit(task).add_done_callback(lambda done: done.result())  # an error goes to the log
 
     def close(self) -> None:
         """End the server; blocks for twice `CLOSE_LIMIT_S` at most. Idempotent."""

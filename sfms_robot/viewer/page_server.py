@@ -2,16 +2,16 @@
 
     /                  the page              /static/...     its files
     /ws                the protocol          /human/head.bin the virtual human (`face.human`)
-    /robot/robot.urdf  the robot, and beside it the meshes that it names (`face.robot_scene` says which are served)
+    /robot/robot.urdf  the robot, and next to it the meshes that it names (`face.robot_scene` says which are served)
     /face_landmarker.task  the model by which a page sees its visitor's face
     /runs/last         the run so far, or the last one: its messages, a line of JSON each
     /recording         the file of the last recording; beyond loopback with ?token=
 
-1. Pictures: the newest wins. A visitor that reads slowly receives fewer of them, not older ones.
+1. Pictures: only the newest is sent. A visitor that reads slowly receives fewer pictures, not older ones.
 2. All other messages wait in order, up to `OUTBOX`; a visitor that is so far behind is disconnected.
-3. Controls: the first visitor to ask has them until it gives them back or disconnects, or another one asks after
-   `IDLE_S` in which they were not used. Halting needs no controls.
-4. Where there is a token (bound beyond loopback), a visitor without it only looks.
+3. Controls: the first visitor to request them has them until it gives them back or disconnects, or another visitor
+   requests them after `IDLE_S` in which they were not used. Halting needs no controls.
+4. If there is a token (bound beyond loopback), a visitor without it can only watch.
 """
 
 from __future__ import annotations
@@ -40,31 +40,31 @@ from sfms_robot.viewer.page_messages import VERSION, Shown, frame_json, message_
 from sfms_robot.viewer.web_server import CompressedFiles, application
 
 URDF: Final = "robot/robot.urdf"
-KEPT_FRAMES: Final = 600 * FRAME_HZ  # of the run, for /runs/last: ten minutes
+KEPT_FRAMES: Final = 600 * FRAME_HZ  # messages of the run kept for /runs/last: ten minutes of pictures
 MOST_VISITORS: Final = 32
 OUTBOX: Final = 200
 IDLE_S: Final = 30.0
 MOST_MALFORMED: Final = 100
-COMMAND_S: Final = 0.004  # time that one command is given, when many arrive
-PERSON_S: Final = 0.001  # and a piece of sound, or a face
+COMMAND_S: Final = 0.004  # time allotted to a command, when many arrive
+PERSON_S: Final = 0.001  # time allotted to a piece of sound, or a face
 PERSON_BYTES_PER_S: Final = 4e6
 BURST_S: Final = 0.25
-FREE: Final = ("hello", "ping", "take", "give")  # commands that take no controls
-_LINES_AT_ONCE: Final = 10  # of a platform each takes a millisecond and a half
+FREE: Final = ("hello", "ping", "take", "give")  # commands that need no controls
+_LINES_AT_ONCE: Final = 10  # for a platform each line takes 1.5 ms
 
 NewScene = Callable[[], RobotScene | None]
 Send = Callable[[int, Facts | bytes], None]
 
 
 class Visitor:
-    """One page that is connected, or another program that looks.
+    """A connected page, or another program that watches.
 
     Attributes:
-        number: no other visitor has had it.
-        allowed: it has shown the token, or there is none.
+        number: number that no earlier visitor had.
+        allowed: whether it has sent the token, or there is none.
         malformed: count of its messages that could not be used.
         used_s: time of its last use of the controls.
-        behind: it reads so slowly that it is to be disconnected.
+        behind: whether it reads so slowly that it has to be disconnected.
     """
 
     def __init__(self, number: int, allowed: bool, now_s: float) -> None:
@@ -76,7 +76,7 @@ class Visitor:
         self._due_s = now_s - BURST_S
 
     def tell(self, message: bytes) -> None:
-        """Send a message, behind those that still wait."""
+        """Send a message, after those that still wait."""
         self.behind = self.behind or len(self._outbox) >= OUTBOX
         self._outbox.append(message.decode())
         self._something.set()
@@ -87,7 +87,7 @@ class Visitor:
         self._something.set()
 
     async def next(self) -> str:
-        """Return what is to be sent now; wait until there is something."""
+        """Return the next message or picture to send; wait until there is one."""
         await self._something.wait()
         if self._outbox:
             message = self._outbox.popleft()
@@ -98,12 +98,12 @@ class Visitor:
         return message
 
     def pause_s(self, cost_s: float, now_s: float) -> float:
-        """Return how long to read nothing more from it, after a message of this cost."""
+        """Return how long to stop reading from the visitor, after a message of this cost."""
         self._due_s = max(self._due_s, now_s - BURST_S) + cost_s
         return max(0.0, self._due_s - now_s)
 
     def check_allowed(self) -> None:
-        """Raise PacketError where the token is still to be shown."""
+        """Raise PacketError if the visitor has not sent the token yet."""
         if not self.allowed:
             raise PacketError("the token is needed for this: it was printed when the robot started")
 
@@ -112,7 +112,7 @@ class Visitors:
     """All visitors that are connected, and the one that holds the controls.
 
     Args:
-        token: needed for more than looking; None: not needed.
+        token: needed for more than watching; None: not needed.
         left: called with the number of a visitor that has lost the controls.
         now: a monotonic clock [s].
     """
@@ -130,7 +130,7 @@ class Visitors:
         return iter(tuple(self._by_number.values()))
 
     def get(self, number: int) -> Visitor | None:
-        """Return a visitor that is still connected."""
+        """Return a visitor by its number; None if it is not connected any more."""
         return self._by_number.get(number)
 
     def enter(self) -> Visitor:
@@ -143,7 +143,7 @@ class Visitors:
         return visitor
 
     def leave(self, visitor: Visitor) -> None:
-        """Forget a visitor."""
+        """Remove a visitor that has disconnected."""
         self._by_number.pop(visitor.number, None)
         if visitor is self._holder:
             self._pass_on(None)
@@ -153,7 +153,7 @@ class Visitors:
         return "nobody" if self._holder is None else "you" if visitor is self._holder else "other"
 
     def greet(self, visitor: Visitor, version: int, token: str) -> None:
-        """Check the version of a page, and its token. Raises PacketError where either is wrong."""
+        """Check the version of a page, and its token. Raises PacketError if either is wrong."""
         if version != VERSION:
             raise PacketError(f"version: expected {VERSION}, got {version}: load the page again")
         if self._token is not None and token:
@@ -163,7 +163,7 @@ class Visitors:
         visitor.tell(self._controls_json(visitor))
 
     def take(self, visitor: Visitor) -> None:
-        """Give a visitor the controls. Raises PacketError where it cannot have them."""
+        """Give a visitor the controls. Raises PacketError if it cannot have them."""
         visitor.check_allowed()
         now_s, holder = self._now(), self._holder
         if holder is not None and holder is not visitor and now_s - holder.used_s < IDLE_S:
@@ -180,7 +180,7 @@ class Visitors:
             visitor.tell(self._controls_json(visitor))
 
     def admit(self, visitor: Visitor, command: str) -> None:
-        """Check that a command is allowed now; free controls are taken. Raises PacketError."""
+        """Check that a command is allowed now, and give the visitor the controls that it needs. Raises PacketError."""
         if command == "halt":
             visitor.check_allowed()
         elif command not in FREE:
@@ -205,26 +205,26 @@ class Visitors:
 
 
 class PageServer:
-    """One page, whatever runs behind it. All in the thread of one event loop.
+    """The server of one page, for any run. All its code runs in the thread of one event loop.
 
     Args:
-        send: sends the run, without waiting, a document or a piece of sound of a visitor (see `page_process`).
+        send: function that sends a document, or a visitor's sound, to the run without waiting (see `page_process`).
         token: see `Visitors`.
 
     Attributes:
-        app: for an ASGI server.
+        app: application for an ASGI server.
     """
 
     def __init__(self, send: Send, token: str | None) -> None:
         self._send_run, self._token = send, token
         self._visitors = Visitors(token, lambda number: send(number, {"left": True}), time.monotonic)
         self._hello: Report = {}
-        self._began = asyncio.Event()  # there is a hello
+        self._began = asyncio.Event()  # set once there is a hello
         self._new_scene: NewScene = lambda: None
         self._scene: RobotScene | None = None
         self._record: Facts | None = None
         self._recording: Path | None = None
-        self._over: Facts | None = None  # the report
+        self._over: Facts | None = None  # report of a run that is over
         self._history = deque[tuple[bool, bytes]](maxlen=KEPT_FRAMES)  # (packed picture or not, message)
         self._files, self._human = CompressedFiles(), CompressedFiles(HUMAN)
         self.app = application(
@@ -241,7 +241,7 @@ class PageServer:
         )
 
     def prepare(self) -> None:
-        """Begin to compress what every page loads, in threads; a page waits for it."""
+        """Start to compress the files that every page loads, in threads; a page waits for them."""
         self._human.prepare("*.xz")
         self._files.prepare()
 
@@ -250,7 +250,7 @@ class PageServer:
     def begin(self, hello: Facts, new_scene: NewScene) -> None:
         """Begin a run: forget the last one, and send its `hello` to all visitors.
 
-        `new_scene`: makes the picture of its head. One remembers where it was; a replay has its own.
+        `new_scene`: function that makes the picture of the head. A picture has a memory, so a replay makes its own.
         """
         self._new_scene, self._scene, self._over = new_scene, new_scene(), None
         self._hello = dict(hello)
@@ -270,23 +270,23 @@ class PageServer:
                 visitor.show(picture)
 
     def keep(self, record: bytes) -> None:
-        """Keep a packed picture for /runs/last alone: a newer one is here already."""
+        """Keep a packed picture only for /runs/last, because a newer one is here already."""
         self._history.append((True, record))
 
     def tell(self, message: bytes, keep: bool = True) -> None:
-        """Send a message of docs/reference/protocol.md to all visitors; `keep`: it belongs to the run."""
+        """Send a message of docs/reference/protocol.md to all visitors; `keep`: whether it belongs to the run."""
         if keep:
             self._history.append((False, message))
         for visitor in self._visitors:
             visitor.tell(message)
 
     def end(self, report: Facts) -> None:
-        """Send visitors the report of the run, which is over."""
+        """Send the report of the run, which is over, to all visitors."""
         self._over = report
         self.tell(message_json(type="over", report=report))
 
     def answer(self, number: int, message: bytes) -> None:
-        """Send a message to one visitor, where it is still connected."""
+        """Send a message to one visitor, if it is still connected."""
         visitor = self._visitors.get(number)
         if visitor is not None:
             visitor.tell(message)
@@ -308,7 +308,7 @@ class PageServer:
         return StreamingResponse(self._lines(), media_type="application/x-ndjson")
 
     async def _lines(self) -> AsyncIterator[bytes]:
-        """Yield the hello, then what the run sent, oldest first; others get their turn in between."""
+        """Yield the hello, then the messages of the run, oldest first; other tasks run in between."""
         hello, shown = self._hello, _values(self._new_scene())
         yield message_json(type="hello", **hello | {"over": True, "replay": True}) + b"\n"
         kept = list(self._history)
@@ -357,7 +357,7 @@ class PageServer:
             self._send_run(0, {"watched": len(self._visitors)})
 
     async def _send(self, socket: WebSocket, visitor: Visitor) -> None:
-        with suppress(WebSocketDisconnect, RuntimeError):  # it has disconnected
+        with suppress(WebSocketDisconnect, RuntimeError):  # the visitor has disconnected
             while not visitor.behind:
                 await socket.send_text(await visitor.next())
             await _refuse(socket, "too far behind: messages waited for too long")

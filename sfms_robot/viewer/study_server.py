@@ -32,7 +32,7 @@ MOST_NAME: Final = 64
 
 
 class Comparison(Protocol):
-    """Questions, clips and answers of a study. Raises ConfigError for an answer that cannot be one."""
+    """Questions, clips and answers of a study. Raises ConfigError for an invalid answer."""
 
     @property
     def questions(self) -> Mapping[str, str]: ...
@@ -48,7 +48,7 @@ class Comparison(Protocol):
 
 
 def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
-    """Return the application for an ASGI server. All in the thread of one event loop."""
+    """Return the application for an ASGI server. All its code runs in the thread of one event loop."""
 
     async def command(request: Request) -> Response:
         if not token_admits(request.headers.get("x-token", ""), token):
@@ -81,7 +81,7 @@ def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
 
 
 def serve_study(study: Comparison, address: Address, ready: Callable[[str, int | None], None]) -> None:
-    """Serve until interrupted; `ready(url, taken port or None)` once. Raises PortError, KeyboardInterrupt."""
+    """Serve until interrupted; calls `ready(url, taken port or None)` once. Raises PortError, KeyboardInterrupt."""
     place = listen_at(address)
     ready(place.url, place.taken)
     web_server(study_app(study, place.token), ws="none").run([place.socket])

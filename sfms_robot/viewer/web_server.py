@@ -1,16 +1,16 @@
-"""Web server of every door of this program: the page, the people study, status, metrics, the fleet's page.
+"""Web server for all web addresses of this program: the page, the people study, status, metrics, the fleet's page.
 
-Each door is a list of routes. `application` puts them behind the access rules, `web_server` serves the application and
-limits what a client may cost, `LocalServer` does both in a thread. The rules, the same at each door:
+Each of them is a list of routes. `application` puts them behind the access rules, `web_server` serves the application
+and limits the cost of a client, `LocalServer` does both in a thread. The rules are the same for all:
 
 1. Host: a request that calls this machine by a name that is not its own is refused (`endpoint.host_problem`).
-2. Origin: WebSockets, and requests other than GET and HEAD, are refused to pages of other sites.
-3. Token: bound beyond loopback, commands and recordings need the token of the printed address.
+2. Origin: WebSockets, and requests other than GET and HEAD, are refused if they come from pages of other sites.
+3. Token: if bound beyond loopback, commands and recordings need the token of the printed address.
 4. Time: a TLS handshake and the head of a request must be complete within `CONNECTION_S`.
 
 A process that has servos or listeners to serve uses a `LocalServer`: a connection is for one request and ends
-`CONNECTION_S` after it began, and the oldest of more than `MOST_CONNECTIONS` makes room for a new one. So a client that
-sends its request at once is answered beside any number of slow ones.
+`CONNECTION_S` after it began, and the oldest of more than `MOST_CONNECTIONS` makes room for a new one. A client that
+sends its request at once is therefore answered, regardless of the number of slow ones.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from sfms_robot.endpoint import LOOPBACK, address_text, host_problem, is_loopbac
 from sfms_robot.errors import ConfigError, InputError, RobotError
 from sfms_robot.viewer.page_process import Address
 
-if TYPE_CHECKING:  # numpy with it, and a port in use is to be said at once
+if TYPE_CHECKING:  # it imports numpy, and a port in use must be reported at once
     from sfms_robot.ports import Document
 
 MOST_CONNECTIONS: Final = 32
@@ -51,8 +51,8 @@ CONNECTION_S: Final = 10.0
 LONGEST_BODY: Final = 4096  # bytes of a command
 STATUS_PORT: Final = 8775
 AUTO: Final = "auto"  # `--status` without a port: `STATUS_PORT`, or the next that is free
-OTHER_PORTS: Final = 20  # that are tried where the usual one is taken
-SEND_BUFFER: Final = 65_536  # bytes on their way to a visitor: pictures that are a second old are of no use
+OTHER_PORTS: Final = 20  # further ports that are tried if the usual one is taken
+SEND_BUFFER: Final = 65_536  # bytes on their way to a visitor; few, as pictures that are a second old are of no use
 STATIC: Final = Path(__file__).with_name("static")
 _HEADERS: Final = {
     "content-security-policy": "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self' blob:; "
@@ -68,7 +68,7 @@ _GZIP_LEVEL: Final = 6
 
 
 def application(routes: Sequence[BaseRoute]) -> ASGIApp:
-    """Return the application of some routes behind the access rules; a RobotError of a route is answered 400."""
+    """Return the application of some routes behind the access rules; a RobotError of a route becomes status 400."""
     app = Starlette(routes=list(routes), exception_handlers={RobotError: _refused})
 
     async def guarded(scope: Scope, receive: Receive, send: Send) -> None:
@@ -77,7 +77,7 @@ def application(routes: Sequence[BaseRoute]) -> ASGIApp:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
         problem = host_problem(host)
-        if problem is None and scope.get("method") not in ("GET", "HEAD"):  # a WebSocket has none
+        if problem is None and scope.get("method") not in ("GET", "HEAD"):  # a WebSocket has no method
             problem = origin_problem(headers.get("origin"), host)
 
         async def with_headers(message: Message) -> None:
@@ -104,7 +104,7 @@ async def json_body(request: Request) -> Report:
         body += part
         if len(body) > LONGEST_BODY:
             raise InputError(f"a message of more than {LONGEST_BODY} bytes")
-    if request.headers.get("content-type", "").partition(";")[0] != "application/json":  # others need no permission
+    if request.headers.get("content-type", "").partition(";")[0] != "application/json":  # others need no preflight
         raise InputError("a message is JSON (Content-Type: application/json)")
     try:
         given = orjson.loads(body or b"{}")
@@ -146,13 +146,13 @@ class PromptConnection(H11Protocol):
 
 
 class BriefConnection(PromptConnection):
-    """HTTP connection for one request, with its answer within the limit; the oldest of too many is ended."""
+    """HTTP connection for one request, to be answered within the limit; the oldest of too many connections is ended."""
 
     handle_events = H11Protocol.handle_events
     on_response_complete = H11Protocol.on_response_complete
 
     def connection_made(self, transport: Any) -> None:
-        """Make room for this connection."""
+        """End the oldest connection if there are too many."""
         super().connection_made(transport)
         if len(self.connections) > MOST_CONNECTIONS:
             others = (each for each in self.connections if isinstance(each, PromptConnection))
@@ -161,7 +161,7 @@ class BriefConnection(PromptConnection):
             oldest.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the limit."""
+        """Cancel the limit."""
         self.deadline.cancel()
         super().connection_lost(exc)
 
@@ -170,7 +170,7 @@ class WebLoop(asyncio.SelectorEventLoop):
     """Event loop whose servers end a TLS handshake that is not over in time, and wait quietly for descriptors."""
 
     async def create_server(self, *given: Any, ssl: Any = None, **more: Any) -> asyncio.Server:
-        """Make a server as asyncio does."""
+        """Make a server as asyncio does, with a limit for TLS handshakes."""
         return await super().create_server(*given, ssl=ssl, ssl_handshake_timeout=ssl and CONNECTION_S, **more)
 
     def call_exception_handler(self, context: Report) -> None:
@@ -180,7 +180,7 @@ class WebLoop(asyncio.SelectorEventLoop):
 
 
 def web_server(app: ASGIApp, connection: type[H11Protocol] = PromptConnection, **options: Any) -> uvicorn.Server:
-    """Return the server of an application. `options`: further ones of `uvicorn.Config`.
+    """Return the server of an application. `options`: further options of `uvicorn.Config`.
 
     A text message that is not UTF-8 is not logged: its connection is closed with code 1007.
     """
@@ -205,13 +205,13 @@ class LocalServer:
     """Server in a thread. It holds its port from construction until `close`; clients wait until `begin`.
 
     Args:
-        flag: names its option in errors, and its thread.
-        routes: made from a function that returns the document of the moment.
-        others: further ports that are tried.
+        flag: its option, as a name in errors and for its thread.
+        routes: function that makes routes from a function that returns the present document.
+        others: number of further ports that are tried.
 
     Attributes:
-        port: the port that is bound; of 0, a free one.
-        url: of its root. note: " (PORT is taken)" for another port than the one that was asked for.
+        port: the port that is bound; for 0, a free one.
+        url: address of its root. note: " (PORT is taken)" if another port than the requested one is bound.
 
     Raises PortError.
     """
@@ -229,13 +229,13 @@ class LocalServer:
         self._thread = threading.Thread(target=self._server.run, args=([self._socket],), name=flag, daemon=True)
 
     def begin(self, document: Document = dict) -> None:
-        """Answer from now on, with this document."""
+        """Start to answer, with this document."""
         self._document = document
         if self._thread.ident is None:
             self._thread.start()
 
     def close(self) -> None:
-        """Give the port back; blocks for a second at most. Idempotent."""
+        """Release the port; blocks for a second at most. Idempotent."""
         self._server.should_exit = True
         if self._thread.ident is not None:
             self._thread.join()
@@ -264,8 +264,8 @@ class ListeningSocket(NamedTuple):
     """A socket that listens, and its address.
 
     Attributes:
-        url: address to open in a browser, with its token where there is one.
-        taken: port that was asked for and is used by another program; None where it was free.
+        url: address to open in a browser, with its token if there is one.
+        taken: port that was requested and is used by another program; None if it was free.
     """
 
     socket: socket.socket
@@ -297,7 +297,7 @@ def listen_at(address: Address) -> ListeningSocket:
 
 
 class CompressedFiles(StaticFiles):
-    """Files of a folder: with gzip for clients that take it, else plain, as are parts of a file.
+    """Files of a folder, with gzip for clients that accept it, otherwise plain. Parts of a file are plain.
 
     A file that is stored as FILE.xz, to be small where it is installed, is served as FILE, and always whole.
     """
@@ -309,13 +309,13 @@ class CompressedFiles(StaticFiles):
         self._packed: dict[tuple[Path, float], asyncio.Task[bytes]] = {}
 
     def prepare(self, pattern: str = "*") -> None:
-        """Begin to compress files of the folder itself; others wait for the first request."""
+        """Start to compress files of the folder itself; other files are compressed at the first request."""
         for file in sorted(self._folder.glob(pattern)):
             if file.is_file():
                 self._gzip(file)
 
     async def get_response(self, path: str, scope: Scope) -> Response:
-        """Return a file."""
+        """Return the response with a file."""
         stored = path in self._stored
         plain = await super().get_response(f"{path}.xz" if stored else path, scope)
         wanted = Headers(scope=scope)
@@ -329,7 +329,7 @@ class CompressedFiles(StaticFiles):
         return Response(await asyncio.to_thread(_plain, file), headers=headers) if stored else plain
 
     def _gzip(self, file: Path) -> asyncio.Task[bytes]:
-        """Return the task of a thread that compresses the file; one for each version of it."""
+        """Return the task of a thread that compresses the file; there is one task for each version of a file."""
         version = (file, file.stat().st_mtime)
         if version not in self._packed:
             work = asyncio.to_thread(lambda: gzip.compress(_plain(file), _GZIP_LEVEL, mtime=0))

@@ -1,4 +1,4 @@
-"""The app: sound of the robot's microphone in, motion out through the daemon that started it."""
+"""The app: receive the robot's microphone, send motion through the daemon that started it."""
 
 import threading
 

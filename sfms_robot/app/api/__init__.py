@@ -1,1 +1,1 @@
-"""The public API: the parts of a run alone, and a run in a thread."""
+"""The public API: single parts of a run, and a run in a thread."""

@@ -1,4 +1,4 @@
-"""A listener without a robot: one 40 ms frame of a person in, now and then a plan out."""
+"""A listener without a robot: 40 ms frames of a person in, a plan out every `hop` frames."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from sfms_robot.signals.face_units import beyond
 def load_listener(name: str | Path, engine: EngineName = "auto") -> LoadedListener:
     """Load a listener by shipped name, folder, or the name under which another package registers its own.
 
-    `engine`: "onnx" or "torch" compute it; "auto": onnxruntime where it has graphs for it, as those that ship. Blocks
-    while its engine and its weights load, half a second, with torch two. Raises ConfigError, ModelError.
+    `engine`: "onnx" or "torch"; "auto": onnxruntime if the listener has graphs for it, as shipped listeners do. Blocks
+    while engine and weights load: half a second, two seconds with torch. Raises ConfigError, ModelError.
     """
-    from sfms_robot.listeners import registry  # an engine comes with what it loads
+    from sfms_robot.listeners import registry  # imports an engine
 
     return LoadedListener(registry.load_listener(name, engine=engine))
 
@@ -53,9 +53,9 @@ class LoadedListener:
 
 
 class ListenerStream:
-    """One person being listened to. Its time is that of the frames pushed: frame i ends at (i + 1) x 40 ms.
+    """A conversation with one person. Its time is that of the pushed frames: frame i ends at (i + 1) x 40 ms.
 
-    One thread at a time.
+    Only one thread at a time may use it.
     """
 
     def __init__(self, listener: Listener, seed: int) -> None:
@@ -71,16 +71,16 @@ class ListenerStream:
     def push(
         self, audio: ArrayLike | None, face: FaceFrame | ArrayLike | None = None, agent_audio: ArrayLike | None = None
     ) -> Plan | None:
-        """Take the next 40 ms; a plan on every `hop`-th frame, None between.
+        """Process the next 40 ms; return a plan on every `hop`-th frame, else None.
 
-        Blocks for as long as the listener computes. A frame that is refused changes nothing.
+        Blocks while the listener computes. A frame that is refused changes nothing.
 
         Args:
             audio: (640,) mono 16 kHz, -1..1; None or empty without a microphone.
-            face: the person's face at the end of the frame, as (58,) motion or a FaceFrame; None where it is not seen.
+            face: the person's face at the end of the frame, as (58,) motion or a FaceFrame; None if it is not seen.
             agent_audio: (640,) the robot's own speech during the next frame; None when it does not speak.
 
-        Raises InputError for another number of samples or channels, and for values in other units, or not finite.
+        Raises InputError for a wrong number of samples or channels, and for values in wrong units or not finite.
         """
         time_s = (self._frames + 1) / FRAME_HZ
         said = None if agent_audio is None else _checked("agent_audio", agent_audio)

@@ -1,4 +1,4 @@
-"""A head that listens, as an object: the loop in its own thread, used from any other.
+"""A head that listens, as an object: its loop has its own thread, and any thread may use the object.
 
 person  ->  hear, see, say      sound and faces from a program; or a source of `run`
 face    ->  show, look_at       replaces the plan of the listener for a while, under the same limits
@@ -33,39 +33,39 @@ from sfms_robot.sources.push import Pcm, PushedSight, PushedSpeech, PushedVoice
 from sfms_robot.sources.registry import split_kind
 
 PUSH: Final = "push"
-EVENTS_LIMIT_S: Final = 1.0  # how long `stop` waits for callbacks
+EVENTS_LIMIT_S: Final = 1.0  # longest wait of `stop` for callbacks
 
 
 class Robot(Driven):
     """A run of `sfms-robot run`, with its options by name, in its own thread.
 
-    `with Robot(...) as robot:` or `Robot(...).start()` and `stop()`: from then on the head moves, until `stop`. In a
-    script, a notebook or any thread; no signal is touched. Methods may be called from any thread; only `start`, `wait`
-    and `stop` wait for the loop.
+    Use `with Robot(...) as robot:`, or `Robot(...).start()` and `stop()`: the head moves from `start` to `stop`. It
+    works in a script, a notebook or any thread, and changes no signal handler. Methods may be called from any thread;
+    only `start`, `wait` and `stop` wait for the loop.
 
     Args:
-        head: shipped name, folder, or what `load_head` gave; "none": no servos, `outputs` alone show the face.
+        head: shipped name, folder, or the result of `load_head`; "none": no servos, only `outputs` show the face.
         port: "sim" for emulated servos, "auto", a device, or NAME=DEVICE[,NAME=DEVICE].
         listener: shipped name, folder, zenoh/NAME, a name that another package registers; or an object that implements
             `Listener`, which is then stepped in a thread of this process.
-        audio: "push" for what `hear`, `see` and `say` hand over; else a source that `run --audio` knows.
-        face, agent_audio: as `run --face`, `--agent-audio`, beside another source than "push".
-        play: the device that plays what the robot says, by number, name or part of one, or "default"; None: the
+        audio: "push" for the data passed to `hear`, `see` and `say`; else a source of `run --audio`.
+        face, agent_audio: as `run --face`, `--agent-audio`, only with a source other than "push".
+        play: the device that plays the robot's speech, by number, name or part of a name, or "default"; None: the
             caller of `say` plays it.
         source: an object of a class derived from `Source`, instead of `audio`, `face` and `agent_audio`. Its `read` is
             called in the loop: it must not block.
         duration_s: seconds after which it ends; None for that of the source.
         fast: virtual time on emulated servos, as fast as they compute; not with "push".
-        seed: of everything that is drawn at random.
-        record: folder for the recording; `overwrite` for one that has a recording already.
+        seed: seed of everything that is drawn at random.
+        record: folder for the recording; `overwrite` if the folder may have a recording already.
         record_format: "json", or "ros2" for tools of ROS.
         yes: hobby servos may jump when they come on.
         without: joints that are left alone.
-        intensity, style: of regions, as in `knobs`.
+        intensity, style: values by region, as in `knobs`.
         calmness, addressed: as in `calm`.
         outputs: KIND or KIND:ADDRESS each, as `run --output`: "vmc:127.0.0.1:39539".
 
-    Raises ConfigError, PortError, InputError for what cannot be right, before anything is opened.
+    Raises ConfigError, PortError, InputError for invalid arguments, before anything is opened.
     """
 
     def __init__(
@@ -140,7 +140,10 @@ class Robot(Driven):
         return self.start()
 
     def start(self) -> Self:
-        """Open the head, torque on, listen. Blocks until the first tick, a second or three. Raises RobotError."""
+        """Open the head, switch torque on, listen. Blocks until the first tick, one to three seconds.
+
+        Raises RobotError.
+        """
         if self._run is not None:
             raise ConfigError("this robot was started before: make another Robot")
         self._run = Background(self._drive, self._controls.interrupt, self._controls.halt)
@@ -152,10 +155,10 @@ class Robot(Driven):
         return self._run is None or self._run.wait(limit_s)
 
     def stop(self) -> None:
-        """Come to rest, switch torque off. Block until then, 4 s at most once it has started; idempotent.
+        """Come to rest, switch torque off. Blocks until then, 4 s at most once it has started. Idempotent.
 
-        A joint that was found far outside its range takes what its limits need, up to a minute. Raises once,
-        as RobotError, what ended the run before.
+        A joint that was found far outside its range takes as long as its limits require, up to a minute. Raises once,
+        as RobotError, the error that ended the run before.
         """
         if self._run is not None:
             try:
@@ -184,16 +187,16 @@ class Robot(Driven):
     # --- sound and sight of the robot ---
 
     def hear(self, pcm: Pcm, rate_hz: float) -> None:
-        """Hand over the person's voice: the next piece of sound, of any length. Never blocks.
+        """Pass the person's voice: the next piece of sound, of any length. Never blocks.
 
-        (n,), (n, channels) or (channels, n), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. It
-        counts from this call on, so hand pieces over as they come, 10 to 100 ms each; of one longer than a second the
-        newest is kept. Raises ConfigError for another type, shape, scale or rate.
+        (n,), (n, channels) or (channels, n), float of full scale 1 or int16; or bytes of 16-bit little-endian mono. The
+        piece begins at the time of the call, so pass pieces as they come, 10 to 100 ms each. Of a piece longer than a
+        second the newest second is kept. Raises ConfigError for another type, shape, scale or rate.
         """
         self._pushed("hear")[0].hear(pcm, rate_hz)
 
     def see(self, face: FaceFrame | Floats | Mapping[str, float] | None) -> None:
-        """Hand over the person's face now: a FaceFrame, motion (58,) or channels by name; None when it is lost.
+        """Pass the person's face now: a FaceFrame, motion (58,) or channels by name; None when it is lost.
 
         It holds for 250 ms. Never blocks. Raises ConfigError for another shape, an unknown channel, and values that are
         not radians or 0 to 1.
@@ -201,12 +204,12 @@ class Robot(Driven):
         self._pushed("see")[1].see(face)
 
     def say(self, pcm: Pcm, rate_hz: float, at_s: float | None = None) -> None:
-        """Hand over the robot's own speech, as `hear`: the lips follow it, and it is not taken for the person.
+        """Pass the robot's own speech, as in `hear`: the lips follow it, and it does not count as the person's.
 
-        With `play=` it is played here, as soon as possible. Else play it yourself, one frame (40 ms) after it is handed
-        over, after the speech that still waits. `at_s` (`time.monotonic`) says when its first sample is played instead:
-        that replaces the speech from then on. Up to two minutes may wait. Never blocks. With a microphone
-        (`audio="mic"`) it is removed from the sound. Raises InputError beside another source.
+        With `play=` it is played here, as soon as possible. Else play it yourself, one frame (40 ms) after this call,
+        after the speech that still waits. Instead, `at_s` (`time.monotonic`) sets the time at which its first sample is
+        played: that replaces the speech from then on. Up to two minutes may wait. Never blocks. With a microphone
+        (`audio="mic"`) it is removed from the sound. Raises InputError with another source.
         """
         self._spoken("say").say(pcm, rate_hz, at_s)
 
@@ -260,12 +263,12 @@ class Robot(Driven):
     # --- events, state, report ---
 
     def on(self, kind: str, callback: Callable[[ListenerEvent], object]) -> None:
-        """Call `callback` with a `ListenerEvent` before the servos do it.
+        """Call `callback` with a `ListenerEvent` before the servos execute it.
 
-        `kind` is one of `frames.EVENT_KINDS`: "nod", "mm_hm", "smile" and so on. A listener that decides events tells
-        all of them; of another one nods, blinks and smiles are found in its plans. The callback runs in a thread of its
-        own, one event after the other; one that raises is detached and named in the log. Raises InputError for another
-        kind.
+        `kind` is one of `frames.EVENT_KINDS`: "nod", "mm_hm", "smile" and so on. A listener that decides events reports
+        all of them; for other listeners, nods, blinks and smiles are found in the plans. The callback runs in a
+        separate thread, one event after the other; a callback that raises is detached and named in the log. Raises
+        InputError for another kind.
         """
         self._events.on(kind, callback)
 
@@ -276,7 +279,7 @@ class Robot(Driven):
         return "stopped" if self._run is None else self._run.state
 
     def report(self) -> Report:
-        """Return the report of `run --json`; during the run its known keys, with "exit": "running"."""
+        """Return the report of `run --json`; during the run only the keys known so far, with "exit": "running"."""
         report = self._run.report if self._run is not None else None
         if report is None:
             options, now = self._options, self._controls.document()

@@ -32,8 +32,8 @@ from sfms_robot.runtime.safety import Interrupt
 
 log = logging.getLogger(__name__)
 
-ARRIVED_RAD: Final = 1e-3  # of the goal sent; the servo itself is behind by its lag
-SLACK_RAD: Final = 1e-9  # so that the end of a range, computed twice, is inside it
+ARRIVED_RAD: Final = 1e-3  # distance of the sent goal at which it has arrived; the servo itself lags behind
+SLACK_RAD: Final = 1e-9  # margin, so that the end of a range, computed twice, is inside it
 _LOOK_S: Final = 0.01
 
 
@@ -41,13 +41,13 @@ _LOOK_S: Final = 0.01
 
 
 class Background(Observer):
-    """A run in its own thread: `work` drives a head until `interrupt` is set, with this as an observer, and reports.
+    """A run in its own thread: `work` drives a head until `interrupt` is set, with this as observer, and reports.
 
-    A program that ends without `stop` is stopped at its exit: the head comes to rest first.
+    If a program ends without `stop`, the run is stopped at its exit: the head comes to rest first.
 
     Attributes:
         seen: the newest tick.
-        interrupt: ends it; `halt`: emergency stop.
+        interrupt: ends the run. halt: emergency stop.
     """
 
     def __init__(self, work: Callable[[Background], Report], interrupt: Interrupt, halt: HaltLatch) -> None:
@@ -83,12 +83,12 @@ class Background(Observer):
         self._came.set()
 
     def start(self) -> None:
-        """Start; block until the first tick, all torque on. Raises the error that prevented it, as RobotError."""
+        """Start; block until the first tick, with all torque on. Raises an error that prevents it, as RobotError."""
         atexit.register(self.stop)
         self._thread.start()
         try:
             self._came.wait()
-        except BaseException:  # Ctrl-C: the caller gets no object that it could stop
+        except BaseException:  # on Ctrl-C the caller has no object to stop
             self.stop()
             raise
         if not self._thread.is_alive() or self.report is not None or self._error is not None:
@@ -100,9 +100,9 @@ class Background(Observer):
         return not self._thread.is_alive()
 
     def stop(self) -> None:
-        """Come to rest, torque off. Block until then; raise an error of the run once, as RobotError.
+        """Come to rest, switch torque off. Block until then; raise an error of the run once, as RobotError.
 
-        A Ctrl-C while it blocks releases at once.
+        A Ctrl-C meanwhile switches torque off at once.
         """
         if self._thread.is_alive() and not self._stopping:
             self._stopping = True
@@ -110,7 +110,7 @@ class Background(Observer):
         self._end()
 
     def release(self) -> None:
-        """Torque off now, without coming to rest first. From any thread; does not wait. Raises nothing."""
+        """Switch torque off now, without coming to rest first. From any thread; does not wait or raise."""
         self._stopping = True
         self.interrupt.ask()
         self.interrupt.ask()
@@ -161,15 +161,16 @@ class Driven:
             log.error("%s", failure)
 
     def stop(self) -> None:
-        """Ease to rest, torque off. Block until then; raise an error of the run once, as RobotError.
+        """Ease to rest, switch torque off. Block until then; raise an error of the run once, as RobotError.
 
-        4 s at most from inside the joints' ranges; one found far outside takes what its limits need, up to a minute.
+        It takes 4 s at most from inside the joints' ranges. A joint that was found far outside takes as long as its
+        limits require, up to a minute.
         """
         if self._run is not None:
             self._run.stop()
 
     def release(self) -> None:
-        """Torque off now, without coming to rest, for emergencies. From any thread; does not wait. Raises nothing."""
+        """Switch torque off now, without coming to rest, in an emergency. From any thread; does not wait or raise."""
         if self._run is not None:
             self._run.release()
 
@@ -177,8 +178,8 @@ class Driven:
 def head_name(head: Head | str) -> str:
     """Return the name or folder of a head that a program loaded, as a run opens it.
 
-    Calibration and stored settings of a build lie beside the head's file, so a head runs from there. Raises
-    ConfigError for one that was changed since it was loaded, or was made without a file.
+    Calibration and stored settings of a build belong to the head's file, so a run loads the head from there. Raises
+    ConfigError for a head that was changed since it was loaded, or was made without a file.
     """
     if isinstance(head, str):
         return head
@@ -196,26 +197,26 @@ def open_bus(head: Head | str, port: str = SIM, *, yes: bool = False, without: S
     """Return the servos of a head, for a `with` block.
 
     Args:
-        head: what `load_head` gave, a shipped name, or a folder.
+        head: the result of `load_head`, a shipped name, or a folder.
         port: "sim" for emulated servos, a device, or NAME=DEVICE[,NAME=DEVICE] for a head of several buses.
         yes: hobby servos report no position and jump when they come on; confirms that nothing is in their way.
         without: joints that are left alone.
 
-    Raises ConfigError for a head or port that cannot be right.
+    Raises ConfigError for an invalid head or port.
     """
     return Servos(HeadOptions(head=head_name(head), port=port, yes=yes, without=tuple(without)))
 
 
 class Servos(Driven):
-    """Joints by their angle. Entering the `with` block connects; leaving it comes to rest and takes torque off.
+    """Joints by their angle. Entering the `with` block connects; leaving it moves to rest and switches torque off.
 
     Every angle passes the limits of position, speed, acceleration and jerk of the head's file. Methods may be called
     from any thread. An error that ended the loop (a bus that failed) is raised by the next call, as RobotError.
 
     Attributes:
-        joints: names, in the order of every (J,).
+        joints: names, in the order of every array (J,).
         low_rad, high_rad: (J,) range of every joint on this port.
-        rest_rad: (J,) where leaving brings them.
+        rest_rad: (J,) angles to which the joints move at the end.
     """
 
     def __init__(self, options: HeadOptions) -> None:
@@ -236,7 +237,7 @@ class Servos(Driven):
             super().__exit__(kind, error, trace)
 
     def enable(self) -> None:
-        """Torque on, each joint held where it stands; one outside its range comes in. Blocks until all are on.
+        """Switch torque on, each joint held where it stands; one outside its range moves in. Blocks until all are on.
 
         Raises ServoError, BusError. Does nothing while torque is on.
         """
@@ -253,14 +254,14 @@ class Servos(Driven):
         """Set the goals of the joints, (J,) rad; the newest replace all others. Returns at once.
 
         The joints move from the next tick on, as fast as their limits allow, and stay there. Raises InputError,
-        with nothing changed, for a shape, a value that is not finite, or an angle outside its joint's range; BusError
-        before `enable`.
+        with nothing changed, for a wrong shape, a value that is not finite, or an angle outside its joint's range;
+        BusError before `enable`.
         """
         self._running()
         self._target.angles_rad = self._checked(angles_rad)
 
     def move(self, angles_rad: ArrayLike, limit_s: float = 10.0) -> bool:
-        """Write, block until the goals sent have arrived or for `limit_s`, and return whether they have."""
+        """Write goals, block until the sent goals have arrived there or for `limit_s`, and return whether they have."""
         self.write(angles_rad)
         run, target = self._running(), self._target.angles_rad
         for _ in range(round(limit_s / _LOOK_S)):

@@ -1,9 +1,9 @@
-"""`head calibrate`: joint by joint, the ends of its range, its rest and its direction.
+"""`head calibrate`: measure, joint by joint, the ends of its range, its rest and its direction.
 
     the servo that answers -> torque off and by hand, or by keys -> ends, rest, direction -> a slow check -> saved
 
-All it needs of a terminal is a line out and a line in, so it works over any connection. Every joint is saved when it
-is done: a calibration that is stopped continues there the next time. Only the overlay of this build is written.
+It only writes and reads single lines, so it works over any connection. Every joint is saved when it is done, so a
+stopped calibration continues there the next time. Only the overlay of this build is written.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ STEPS_DEG: Final[Mapping[str, float]] = {"+": 1.0, "-": -1.0, "++": 5.0, "--": -
 TITLES: Final[Mapping[str, str]] = {"min": "LOWER end", "max": "UPPER end", "rest": "REST"}
 _PERIOD_S: Final = 0.01
 _TRIES: Final = 20
-_PULSE_US: Final = (500.0, 2500.0)  # the most that a hobby servo may be sent, whatever its board can generate
+_PULSE_US: Final = (500.0, 2500.0)  # widest pulses that a hobby servo may be sent, even if its board can generate more
 
 
 Say = Callable[[str], object]
@@ -89,7 +89,7 @@ class CalibrationOutcome(BaseModel):
 def calibrate(
     name: str, port: str, say: Say, ask: Ask, joints: Sequence[str] = (), again: bool = False
 ) -> CalibrationOutcome:
-    """Lead the user of `say` and `ask` through the joints of a head on `port`, or those named.
+    """Guide the user, by `say` and `ask`, through the joints of a head on `port`, or through the given `joints`.
 
     Emulated servos (`sim`) are for practice: their measurements are kept apart and never used. `again`: also joints
     that are measured already. Raises RobotError.
@@ -103,7 +103,7 @@ def calibrate(
 def calibrate_on(
     name: str, where: Opened, clock: Clock, guide: Guide, file: Path, *, joints: Sequence[str] = (), again: bool = False
 ) -> CalibrationOutcome:
-    """Calibrate as `calibrate` does, on buses that are there, into `file`."""
+    """Calibrate as `calibrate` does, on the buses at `where`, into `file`."""
     head, sha256 = load_head(name), head_hash(name)
     for joint in joints:
         if joint not in head.joints:
@@ -160,9 +160,9 @@ def calibrate_on(
 
 @dataclass(frozen=True)
 class Guide:
-    """The questions of a calibration. Each raises KeyboardInterrupt for "q" and at the end of the lines.
+    """The questions of a calibration. Each raises KeyboardInterrupt for "q" and at the end of the input.
 
-    `doctor`: the command that a message about a stored value names, see `BusServo`.
+    `doctor`: the command that is named in messages about stored values, see `BusServo`.
     """
 
     say: Say
@@ -178,14 +178,14 @@ class Guide:
         return False
 
     def asks_how(self, blind: bool) -> bool:
-        """Ask whether the joint is moved by hand; one whose servo reports no position is moved by keys."""
+        """Ask whether the joint is moved by hand; a joint whose servo reports no position is moved by keys."""
         if blind:
             self._ask("  It reports no position and JUMPS when it comes on: keep clear. Enter: by keys, s: skip > ")
             return False
         return self._ask("  Enter: by hand, torque off; k: by keys; s: skip > ") != "k"
 
     def measure_until_right(self, joint: Joint, identity: Identity, at: JointProbe, by_hand: bool) -> Measured:
-        """Measure a joint until the measurement can be right. Raises SkippedError, BusError, ServoError."""
+        """Measure a joint until the measurement is plausible. Raises SkippedError, BusError, ServoError."""
         while True:
             try:
                 return self._measure(joint, identity, at, by_hand)
@@ -216,7 +216,7 @@ class Guide:
         )
 
     def _point(self, joint: Joint, point: str, at: JointProbe, by_hand: bool) -> int:
-        """Return the ticks at which the user says that the joint is at its end or its rest."""
+        """Return the ticks at which, according to the user, the joint is at its end or its rest."""
         where = f"  {TITLES[point]} ({getattr(joint, f'{point}_deg'):g} deg in its file)"
         if by_hand:
             at.limp()
@@ -275,12 +275,12 @@ def _check(head: Head, sha256: str, servos: Mapping[str, Identity | None], outco
 class JointProbe:
     """A joint on an open bus.
 
-    The bus is opened with this joint alone and with the whole travel of its servo as its range, for its range has yet
-    to be found. It moves only on request, at a slow and steady pace.
+    The bus is opened with this joint alone and with the whole travel of its servo as its range, since its range is not
+    known yet. It moves only on request, at a slow and steady pace.
 
     Attributes:
         tells: whether its servo reports its position.
-        ticks_per_deg: of the joint, without direction.
+        ticks_per_deg: ticks per degree of the joint, without direction.
     """
 
     def __init__(self, name: str, joint: Joint, bus: Bus, clock: Clock) -> None:
@@ -289,10 +289,10 @@ class JointProbe:
         self._joint, self._bus, self._clock = joint, bus, clock
         self._calibration = calibration_of({name: joint})
         self.ticks_per_deg = math.radians(abs(float(self._calibration.ticks_per_rad[0])))
-        self._goal_rad: float | None = None  # with torque, where it is held
+        self._goal_rad: float | None = None  # the position at which it is held; None without torque
 
     def ticks(self) -> int:
-        """Return its position; of a servo that reports none, its goal. Raises ServoError."""
+        """Return its position, or its goal if the servo reports no position. Raises ServoError."""
         if not self.tells:
             return self._ticks(self._goal_rad if self._goal_rad is not None else self._joint.rest_rad)
         for _ in range(_TRIES):
@@ -303,7 +303,7 @@ class JointProbe:
         raise ServoError(f"{self.name} (id {self._joint.id}) does not report its position")
 
     def limp(self) -> None:
-        """Switch torque off, for a hand to move it. Raises TorqueError where that could not be confirmed."""
+        """Switch torque off, so that a hand can move it. Raises TorqueError if that could not be confirmed."""
         self._bus.stop("release")
         if unconfirmed := self._bus.statistics()["torque_unconfirmed"]:
             raise TorqueError(unconfirmed)
@@ -343,15 +343,15 @@ def probe(
     unconfirmed: list[str],
     doctor: str,
 ) -> Iterator[JointProbe]:
-    """Open the joint's bus; limp again at the end, or named in `unconfirmed`.
+    """Open the joint's bus. At the end switch torque off, and add the joint to `unconfirmed` if that is not confirmed.
 
-    `stored`: zero and direction as its servo stores them; a measurement may begin from any. Raises RobotError for a
-    servo that is not what the head says.
+    `stored`: zero and direction as its servo stores them; a measurement may begin from any values. Raises RobotError
+    for a servo that contradicts the head's file.
     """
     joint, safety = head.joints[name], head.safety_of(name)
     safety = safety.replaced(stop="release", stored={**safety.stored, **stored})
     joint = joint.replaced(safety=safety, **_whole_travel(joint))
-    # A person thinks longer than a watchdog waits.
+    # A user takes longer to answer than a watchdog waits.
     config = head.buses[joint.bus].replaced(watchdog_ms=0)
     alone = head.replaced(joints={name: joint}, buses={joint.bus: config})
     bus = build_bus(alone, {joint.bus: where}, clock, confirmed=True, doctor=doctor)
@@ -365,7 +365,7 @@ def probe(
 
 
 def _whole_travel(joint: Joint) -> dict[str, float]:
-    """Return the range in which the servo, or a common one on a board, can be sent anywhere; rest is inside."""
+    """Return the whole range of the servo, or of a common servo on a board, extended to include rest."""
     firmware = load_firmware_map(joint.model)
     ticks = 0, int(firmware.ticks_per_revolution) - 1
     if firmware.pulse_us is not None and firmware.tick_us is not None:

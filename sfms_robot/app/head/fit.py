@@ -1,10 +1,10 @@
 """`head fit`: a recording of a head's joints, and a face tracker's track of it -> drives that show each expression.
 
-A recording is a folder: `run.mcap` as `run --record` and `head fit --babble` write it, and beside it `face.csv` (or
-.csv.gz), the track of the robot's face on the same clock. The delay of the tracker is found from the two.
+A recording is a folder: `run.mcap` as `run --record` and `head fit --babble` write it, and `face.csv` (or .csv.gz), the
+track of the robot's face on the same clock. The delay of the tracker is estimated from the two.
 
 `--babble` moves every channel that the head follows up and down once, alone; then several at a time, at random, as
-faces do. Poses of the head stay at rest, so that a camera in front of it sees the face throughout.
+faces do. The pose of the head stays at rest, so that a camera in front of it sees the face throughout.
 """
 
 from __future__ import annotations
@@ -45,25 +45,25 @@ from sfms_robot.runtime.safety import EASE_S
 from sfms_robot.signals.tracks import Track, read_track, write_track
 
 FACE_FILES: Final = ("face.csv", "face.csv.gz")
-PRACTICE_NOISE: Final = 0.01  # of a blendshape, 1 sigma
+PRACTICE_NOISE: Final = 0.01  # noise of a blendshape, 1 sigma
 _PRACTICE_SEED: Final = 1
-ALONE_S: Final = 1.6  # of a channel, up and down again
-TOGETHER_S: Final = 1.0  # from one random face to the next
+ALONE_S: Final = 1.6  # time for one channel alone, up and down again
+TOGETHER_S: Final = 1.0  # time from one random face to the next
 AT_ONCE: Final = 6  # channels in a random face
 _DELAYS_S: Final = np.arange(-0.1, 0.41, 0.02)
 _BLOCK: Final = 50  # frames; every fifth block is held out
-_MOVING: Final = 0.05  # joint units
-_LEAST_MOTION_PRICE: Final = 0.002  # of skin motion, against a joint's value that is not explained
-_SIZE_PRICE: Final = 0.01  # for shapes that hardly move the skin
+_MOVING: Final = 0.05  # least travel of a joint that counts as moving, in joint units
+_LEAST_MOTION_PRICE: Final = 0.002  # weight of skin motion, against the unexplained part of a joint's value
+_SIZE_PRICE: Final = 0.01  # weight of the size of a shape, for shapes that hardly move the skin
 
 
 # --- babble -----------------------------------------------------------------------------------------------------------
 
 
 def babble(options: HeadOptions, record: Path, *, minutes: float, seed: int, panel: Panel | None = None) -> Report:
-    """Move, and record the run in a folder. Block until then; return its report.
+    """Move the face at random, and record the run in a folder. Block until the end; return its report.
 
-    Raises RobotError, the head at rest; ConfigError before it moves where the fit could not be written.
+    Raises RobotError with the head at rest; ConfigError, before it moves, if the fit could not be written.
     """
     head = load_head(options.head)
     check_writable(overlay_file(head.name, practice=options.port == SIM))
@@ -76,7 +76,7 @@ def babble(options: HeadOptions, record: Path, *, minutes: float, seed: int, pan
 
 
 def random_faces(channels: Sequence[int], duration_s: float, seed: int) -> FaceTrack:
-    """Return each channel alone, then random faces until the time is over; neutral at both ends."""
+    """Return a track of each channel alone, then of random faces until the time is over; neutral at both ends."""
     rng = np.random.default_rng(seed)
     times_s, shapes = [EASE_S], [np.zeros(len(BLENDSHAPES))]
     for channel in channels:
@@ -99,10 +99,10 @@ def random_faces(channels: Sequence[int], duration_s: float, seed: int) -> FaceT
 def fit_head(name: str, recording: Path) -> Report:
     """Learn from a recording, write the overlay's fit layer, and report both. Raises ConfigError for a bad recording.
 
-    Errors are rms in joint units on held-out frames, of the seen value against the commanded one: `before` with the
-    drive of the file, `after` with the response learnt; None for a joint that hardly moved. `file`: that was written.
+    Errors are rms in joint units on held-out frames, between the seen and the commanded value: `before` with the drive
+    of the file, `after` with the learnt response; None for a joint that hardly moved. `file`: the written file.
 
-    `practice`: the recording is of emulated servos; its fit goes beside that of the real head and is never used.
+    `practice`: the recording is of emulated servos; its fit is kept apart from that of the real head and never used.
     """
     shipped, sha256, run = load_head(name), head_hash(name), read_recording(recording)
     practice = run.about.get("port") == SIM
@@ -114,7 +114,7 @@ def fit_head(name: str, recording: Path) -> Report:
     has, looks = units.values(angles_rad), looks_like(head, shapes)
     held_out = np.arange(len(has)) // _BLOCK % 5 == 4
     dead = np.array([drive is None for drive in drives(head).values()])
-    has[:, dead] = looks[:, dead] = 0.0  # a neck, say: nothing on the face follows it
+    has[:, dead] = looks[:, dead] = 0.0  # for example a neck joint, which moves nothing on the face
     trial = fit(has[~held_out], looks[~held_out], units.low, units.high)
     rows = _rows(head, trial, has[held_out], looks[held_out])
     measured = [row for row in rows if row["moved"] is not None]
@@ -127,7 +127,7 @@ def fit_head(name: str, recording: Path) -> Report:
         note=f"{len(has)} frames of {recording.name}",
         joints={joint: Fitted(drive=drive) for joint, drive in learnt.items()},
     )
-    layered(shipped, changed := overlay.replaced(fit=layer), sha256)  # refuses what is not sound
+    layered(shipped, changed := overlay.replaced(fit=layer), sha256)  # raises ConfigError for an invalid layer
     save_overlay(changed, file)
     return {
         "head": head.name,
@@ -168,7 +168,7 @@ def read_pairs(head: Head, folder: Path, run: RunRecording) -> tuple[Doubles, Fl
     times_s, shapes = track.times_s[seen], track.motion[seen][:, SHAPES]
     columns = [run.joints.index(joint) for joint in head.joints]
     goals, present = run.goals_rad[:, columns], run.present_rad[:, columns]
-    angles = np.where(np.isfinite(present).all(axis=0), present, goals)  # a hobby servo never tells where it is
+    angles = np.where(np.isfinite(present).all(axis=0), present, goals)  # a hobby servo reports no position
     delay_s = _delay(head, run.times_s, angles, times_s, shapes)
     at_s = times_s - delay_s
     inside = (at_s >= run.times_s[0]) & (at_s <= run.times_s[-1])
@@ -184,7 +184,7 @@ def _at(at_s: Doubles, times_s: Doubles, values: Doubles) -> Doubles:
 
 
 def _delay(head: Head, run_s: Doubles, angles: Doubles, face_s: Doubles, shapes: Floats) -> float:
-    """Return the delay of the tracker [s]: the one at which joints and faces correlate best."""
+    """Return the delay of the tracker [s] at which joints and faces correlate best."""
     units = Units.of(head)
     looks = looks_like(head, shapes)
     moving = np.flatnonzero((np.ptp(units.values(angles), axis=0) > _MOVING) & (np.ptp(looks, axis=0) > _MOVING))
@@ -201,7 +201,7 @@ def _delay(head: Head, run_s: Doubles, angles: Doubles, face_s: Doubles, shapes:
 
 
 def see_virtual_face(name: str, folder: Path) -> None:
-    """Write the track of a virtual face, with a random skin, beside a recorded run on emulated servos."""
+    """Write the track of a virtual face, with a random skin, into the folder of a run on emulated servos."""
     head, run = load_head(name), read_recording(folder)
     columns = [run.joints.index(joint) for joint in head.joints]
     step = max(1, round(0.04 / float(np.median(np.diff(run.times_s)))))
@@ -218,7 +218,7 @@ Skin = Callable[[Doubles], Doubles]  # values of joints (N, J) -> their look (N,
 
 
 def hidden_skin(joints: int, seed: int) -> Skin:
-    """Return a random skin: gain x (|value| beyond a dead band)^power for each joint, on its own side of rest."""
+    """Return a random skin: gain x (|value| beyond a dead band)^power for each joint and each side of rest."""
     rng = np.random.default_rng(seed)
     ranges = (0.85, 1.3), (0.5, 2.0), (0.0, 0.06)
     parts = [rng.uniform(low, high, (2, joints)) for low, high in ranges]  # below rest, above rest
@@ -233,10 +233,10 @@ def hidden_skin(joints: int, seed: int) -> Skin:
 
 
 class Tracker:
-    """A face tracker before the virtual face of a head: joint values in, blendshapes out.
+    """A virtual face tracker that sees the virtual face of a head: joint values in, blendshapes out.
 
-    It reports the face that explains the look of the joints: of all blendshapes 0..1 that would drive the joints so,
-    those that move the virtual head's skin least. skin: None for the one that the head's file assumes.
+    It reports the face that explains the look of the joints: of all blendshapes 0..1 that would drive the joints like
+    this, those that move the virtual head's skin least. `skin` None: the skin that the head's file assumes.
     """
 
     def __init__(self, head: Head, skin: Skin | None = None) -> None:
@@ -259,9 +259,9 @@ class Tracker:
 
 
 def skin_motion() -> Doubles:
-    """Return (52, 52) how much two blendshapes move the skin alike; the mean of its diagonal is 1.
+    """Return a matrix (52, 52) of how similarly two blendshapes move the skin; the mean of its diagonal is 1.
 
-    For blendshapes b, b skin_motion b is the mean square way of the vertices, in units of that of one shape.
+    For blendshapes b, b skin_motion b is the mean square displacement of the vertices, in units of that of one shape.
     """
     deltas = load_human().deltas.reshape(len(BLENDSHAPES), -1).astype(np.float64)
     gram = deltas @ deltas.T

@@ -3,12 +3,12 @@
 `head check` first reports every problem of the head's file. A sound head is then shown recorded faces, without its
 limits, and the demands on its joints are compared with those limits.
 
-For the fidelity the head's joints follow a face, without limits and servos; their positions are a face again (the one
-that explains them while moving the virtual head's skin least); and the loss is measured on that skin:
+For the fidelity the head's joints follow a face, without limits and servos. Their positions are converted back to a
+face (the one that explains them with the least motion of the virtual head's skin). The loss is measured on that skin:
 
     share = 1 - sum over frames of |motion of the skin that is missing or wrong|^2 / sum of |motion of the skin|^2
 
-0 where a head shows nothing, or more wrong than right. For the head's pose it is the same with angles of rotation.
+It is 0 if a head shows nothing, or more wrong than right. For the head's pose it is the same with angles of rotation.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ _WIDTH_IN: Final = 9.0
 _ROW_IN: Final = 0.22
 _DPI: Final = 80
 
-SHORTEST = 4  # frames that a curve can be laid through
-_PARTS = {  # kinds of recorded motion, and the channels that they give
+SHORTEST = 4  # frames, the fewest for a curve through them
+_PARTS = {  # kinds of recorded motion, and the channels that they contain
     "faces": SHAPES,
     "talk": SHAPES,
     "smiles": SHAPES,
@@ -59,23 +59,21 @@ _PARTS = {  # kinds of recorded motion, and the channels that they give
     "sway": slice(0, 3),
 }
 _ANGLES = slice(0, 3)
-_EVERY = 5  # frames: faces of two neighbours hardly differ
+_EVERY = 5  # only every fifth frame is used: faces of two neighbours hardly differ
 
 
 def check(name: str, data: Path | None = None, listener: str | None = None, packages: Sequence[str] = ()) -> Report:
     """Check a head by shipped name or folder, on the bundled faces or those in a folder; return the report.
 
-    A head with `problems` has no other values. `remarks`: what is allowed and probably not meant, and
-    the parts of its picture that are not drawn. For each of `joints`
-    there are the `channels` that move it, by its drive or by the neck; `used`: share of its range that the recorded
-    faces move it through; `clipped`: share of the time that it is at an end of its range that is not its rest;
-    `speed`, `jerk`: 99th percentile of the demand, as a share of its limit, over 1 the limiter lags. `neck`: reach
-    along each axis from home [deg or mm], and the share of recorded poses within it, None where no recorded face moves
-    its head. `limitation`: channels that the named
-    listener shows on no head.
+    A head with `problems` has no other values. `remarks`: settings that are allowed but probably not intended, and
+    parts of its picture that are not drawn. Each of `joints` has its `channels`, which move it by its drive or by the
+    neck; `used`: share of its range through which the recorded faces move it; `clipped`: share of the time that it is
+    at an end of its range that is not its rest; `speed`, `jerk`: 99th percentile of the demand, as a share of its limit
+    (over 1 the limiter lags). `neck`: reach along each axis from home [deg or mm], and the share of recorded poses
+    within it, None if no recorded face moves its head. `limitation`: channels that the named listener shows on no head.
 
-    `packages`: folders outside the head's that meshes may come from. Raises ConfigError for bad data, and for a
-    listener that is not one.
+    `packages`: folders outside the head's that meshes may come from. Raises ConfigError for bad data, and for an
+    unknown listener.
     """
     report: Report = {
         "name": name,
@@ -98,7 +96,7 @@ def check(name: str, data: Path | None = None, listener: str | None = None, pack
         check_safety(head, head.joints)
         retargeter = HeadRetargeter(head, 1.0 / _TICK_HZ)
         scene = scene_of(head, packages)
-    except ConfigError as error:  # what no servo of it can do, a home that is out of reach, a broken URDF
+    except ConfigError as error:  # a rule that its servos cannot keep, a home that is out of reach, a broken URDF
         return report | {"problems": [str(error)]}
     clips = [clip for _, clip in named_faces(data)]
     return report | {
@@ -114,7 +112,7 @@ def check(name: str, data: Path | None = None, listener: str | None = None, pack
 
 
 def _angles(retargeter: HeadRetargeter, clip: Floats) -> Doubles:
-    """Return angles (N, J) at the tick rate for a clip (T, 58), a curve without kinks, as if every frame were held."""
+    """Return angles (N, J) at the tick rate for a clip (T, 58), along a smooth curve, as if every frame were held."""
     times_s = np.arange(len(clip)) * FRAME_S
     ticks_s = np.arange(int((len(clip) - 1) * _TICK_HZ / FRAME_HZ) + 1) / _TICK_HZ
     motion, count = CubicSpline(times_s, clip.astype(np.float64))(ticks_s), len(retargeter.joints)
@@ -173,7 +171,7 @@ def _channels(head: Head, retargeter: HeadRetargeter) -> dict[str, Sequence[str]
 def _neck(neck: Neck, clips: Sequence[Floats]) -> Report:
     poses = np.concatenate([clip[:, : len(POSE_CHANNELS)] for clip in clips]).astype(np.float64)
     shown = np.array([channel in neck.axes for channel in POSE_CHANNELS])
-    moved = np.abs(poses).max(axis=1) > 0  # clips without head motion do not count
+    moved = np.abs(poses).max(axis=1) > 0  # frames without a head pose do not count
     wanted = np.where(shown, poses, 0.0)[moved]
     reached = float(neck.solve(wanted).reached.mean()) if len(wanted) else None
     return {"reach": {axis: _reach(neck, axis) for axis in POSE_CHANNELS if axis in neck.axes}, "reached": reached}
@@ -195,7 +193,7 @@ def _reach(neck: Neck, axis: str) -> tuple[float, float]:
 def plot(checked: Report, png: Path) -> None:
     """Draw the check of a sound head: ranges, the part that recorded faces use, and the speed and jerk they demand.
 
-    Raises ConfigError where the file cannot be written, MissingExtra without matplotlib.
+    Raises ConfigError if the file cannot be written, MissingExtra without matplotlib.
     """
     joints = checked["joints"]
     figure = new_figure(_WIDTH_IN, 1.3 + _ROW_IN * max(len(joints), 4), _DPI)
@@ -223,7 +221,7 @@ def plot(checked: Report, png: Path) -> None:
 def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> Report:
     """Score every shipped head (or those named) on every recorded face, and on all together. Raises ConfigError.
 
-    A row has shares 0..1 of expression and pose; None where the recording has no such motion.
+    A row has shares 0..1 of expression and pose; None if the recording has no such motion.
     """
     names = list(heads) or head_names()
     faces: dict[str, list[Floats]] = {}
@@ -243,7 +241,7 @@ def fidelity(heads: Sequence[str] = (), data: Path | None = None) -> Report:
             wanted = motion[::_EVERY, SHAPES].astype(np.float64)
             turns = np.zeros((len(motion), len(POSE_CHANNELS)))
             turns[:, _ANGLES] = motion[:, _ANGLES]
-            missing = turns if neck is None else neck.solve(turns).residual_rad  # without a neck, all of it
+            missing = turns if neck is None else neck.solve(turns).residual_rad  # without a neck, all is missing
             lost = tracker.face(asked(head, wanted)) - wanted
             sums[face] = np.array(
                 [len(motion) * FRAME_S, energy(lost), energy(wanted), (missing**2).sum(), (turns**2).sum()]

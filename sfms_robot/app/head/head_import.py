@@ -24,7 +24,7 @@ from sfms_robot.config.base import read
 from sfms_robot.data import Report, head_file
 from sfms_robot.errors import ConfigError
 
-LIMITS: Final = {"speed_deg_s": 150, "acceleration_deg_s2": 1500, "jerk_deg_s3": 90_000}  # of a slow neck
+LIMITS: Final = {"speed_deg_s": 150, "acceleration_deg_s2": 1500, "jerk_deg_s3": 90_000}  # limits of a slow neck
 _BAUD: Final = 1_000_000  # LeRobot's and pypot's default
 _CHANNELS: Final = {  # the words of a joint's name that stand for a channel; axes only count in a neck
     "yaw": ("yaw", "pan", "rotation", "neck z"),
@@ -32,23 +32,23 @@ _CHANNELS: Final = {  # the words of a joint's name that stand for a channel; ax
     "roll": ("roll", "neck x"),
     "jawOpen": ("jaw", "mouth", "beak"),
 }
-_PYPOT_MODELS: Final = {"ax-12": "ax-12a", "ax-18": "ax-18a"}  # by pypot's names; MX depend on the protocol
+_PYPOT_MODELS: Final = {"ax-12": "ax-12a", "ax-18": "ax-18a"}  # model by pypot's name; MX models depend on the protocol
 _REACHY: Final = "reachy_mini"
 
 Draft = tuple[Report, list[str]]  # the plain data of a head.yaml, and the remarks
 
 
 def import_head(file: Path, folder: Path | None = None, model: str | None = None) -> Report:
-    """Write a head folder from the file of another program. The servos are neither asked nor moved.
+    """Write a head folder from the file of another program. The servos are neither read nor moved.
 
-    Returns the folder, what the file was `read_as`, the joints, and `remarks`: what was left out, assumed or has to be
-    checked, one line each.
+    Returns the `folder`, the kind of file that it was `read_as`, the `joints`, and `remarks`: one line for each
+    value that was left out, was assumed or has to be checked.
 
     Args:
-        folder: a new folder; None: one of the file's name in the current folder.
-        model: of the servos, for LeRobot's calibration, which does not name it.
+        folder: a new folder; None: a folder with the file's name in the current folder.
+        model: model of the servos, for LeRobot's calibration, which does not name it.
 
-    Raises ConfigError for a file of another kind, one that makes no valid head, and a folder that exists.
+    Raises ConfigError for a file of another kind, a file that makes no valid head, and a folder that exists.
     """
     folder = folder or Path(re.sub(r"\W+", "_", file.stem).strip("_") or "head")
     if folder.exists():
@@ -118,11 +118,11 @@ def _from_lerobot(raw: Any, file: Path, name: str, model: str | None) -> Draft:
         raise ConfigError.at(file, "--model", model, "is a model that LeRobot does not drive", driven)
     feetech = table.family == "feetech"
     family = "feetech" if feetech else f"dynamixel{table.protocol}"
-    # LeRobot's homing makes the middle of the joint, where it was held by hand, half a turn: 2047 of 4096.
+    # LeRobot's homing sets the middle of the joint, where it was held by hand, to half a turn: 2047 of 4096.
     zero = int((table.ticks_per_revolution - 1) / 2)
     joints = {}
     for title, motor in motors.items():
-        # Of a Feetech servo LeRobot negates values itself; in a Dynamixel the mode is a register of its own.
+        # For a Feetech servo LeRobot negates values itself; a Dynamixel has a register for the mode.
         sign = -1 if motor.drive_mode and feetech else 1
         joint = _joint(motor.id, table, zero, sign, (motor.range_min, motor.range_max))
         stored = {"homing_offset": motor.homing_offset} if "homing_offset" in table.registers else {}
@@ -138,7 +138,7 @@ def _from_lerobot(raw: Any, file: Path, name: str, model: str | None) -> Draft:
 
 
 class PypotController(BaseModel):
-    """A bus of pypot's; `attached_motors` holds motors and groups of them."""
+    """A bus of pypot; `attached_motors` holds motors and groups of them."""
 
     attached_motors: list[str]
     port: str = "auto"
@@ -147,7 +147,7 @@ class PypotController(BaseModel):
 
 
 class PypotMotor(BaseModel):
-    """A motor of pypot's, in degrees. `angle_limit` is the servo's own, without `offset` and `orientation`."""
+    """A motor of pypot, in degrees. `angle_limit` is that of the servo, without `offset` and `orientation`."""
 
     id: int
     type: str
@@ -158,7 +158,7 @@ class PypotMotor(BaseModel):
 
 
 class PypotRobot(BaseModel):
-    """A robot of pypot's: `software/NAME/configuration/NAME.json` of Poppy's projects."""
+    """A robot of pypot: `software/NAME/configuration/NAME.json` of Poppy's projects."""
 
     controllers: dict[str, PypotController]
     motorgroups: dict[str, list[str]] = {}
@@ -259,7 +259,7 @@ def _from_reachy(raw: Any, file: Path, name: str, model: str | None) -> Draft:
             continue
         low, high = ((limit - 2048) * 360 / 4096 for limit in (motor.lower_limit, motor.upper_limit))
         joint = {**joint, "id": motor.id}
-        if twin is None:  # a range within both; a twin mirrors the other's
+        if twin is None:  # the common part of both ranges; a twin mirrors the range of the other joint
             joint |= {"min_deg": max(low, joint["min_deg"]), "max_deg": min(high, joint["max_deg"])}
         joint["safety"] = {"registers": {"position_p_gain": motor.pid[0]}, "stored": {"homing_offset": motor.offset}}
         joints[title] = {key: value for key, value in joint.items() if key != "note"}
@@ -286,7 +286,7 @@ def _from_reachy(raw: Any, file: Path, name: str, model: str | None) -> Draft:
 
 
 def _joint(servo: int, table: FirmwareMap, zero: int, sign: int, ticks: tuple[int, int]) -> Report:
-    """Return the place, direction and range of a joint; it rests at zero, or at the end of its range next to it."""
+    """Return the place, direction and range of a joint; its rest is zero, or the end of its range nearest to zero."""
     low, high = (sign * (tick - zero) * 360 / table.ticks_per_revolution for tick in ticks[::sign])
     joint = {"id": servo, "model": table.model, "zero_ticks": zero, "min_deg": round(low, 2), "max_deg": round(high, 2)}
     if sign < 0:
@@ -305,13 +305,13 @@ def _name(given: str, remarks: list[str]) -> str:
 
 
 def _finished(name: str, description: str, buses: Report, joints: Report, remarks: list[str]) -> Draft:
-    """Return the head with a drive for each joint whose name stands for one channel that no other joint's does."""
+    """Return the head; a joint gets a drive if it is the only one whose name stands for a channel."""
     words = {joint: set(re.split(r"[_\d]+", joint.lower().replace("head", "neck"))) for joint in joints}
     for channel, known in _CHANNELS.items():
         named = [joint for joint, has in words.items() if any(has.issuperset(each.split()) for each in known)]
         if len(named) == 1:
             joint = joints[named[0]]
-            opens = 1 if joint["max_deg"] >= -joint["min_deg"] else -1  # a jaw opens to its longer side
+            opens = 1 if joint["max_deg"] >= -joint["min_deg"] else -1  # a jaw opens to the longer side of its range
             drive = {"channel": channel, "gain": opens} if channel == "jawOpen" and opens < 0 else channel
             joint |= {"unit": "range" if channel == "jawOpen" else "rad", "drive": drive}
             remarks.append(f"{named[0]}: drive {channel} is taken from its name; see that it turns the right way")
@@ -324,7 +324,7 @@ def _finished(name: str, description: str, buses: Report, joints: Report, remark
         "version": 1,
         "name": name,
         "description": description,
-        "calibrate_first": True,  # directions were not measured with the head as it is built
+        "calibrate_first": True,  # directions were not measured on the assembled head
         "buses": buses,
         "limits": {"all": dict(LIMITS)},
         "joints": joints,

@@ -15,19 +15,19 @@ _COLUMNS: Final = 3
 
 
 def scene_of(head: Head, packages: Sequence[str] = ()) -> RobotScene:
-    """Return the scene of a head, a generic one where it is not shipped and names no URDF. Raises ConfigError.
+    """Return the scene of a head, a generic one if the head is not shipped and names no URDF. Raises ConfigError.
 
     `packages`: folders outside the head's that meshes may come from.
     """
-    from sfms_robot.retarget.head_retargeter import build_neck  # half a second of imports, later than the page's start
+    from sfms_robot.retarget.head_retargeter import build_neck  # half a second of imports, after the page's start
 
     neck = build_neck(head.kinematics, head.joints) if head.kinematics else None
     return RobotScene.of(head, neck, packages)
 
 
 def main() -> None:
-    """See `viewer.page_child`."""
-    from sfms_robot.viewer import page_child  # of the page's process alone
+    """Run the page's process, see `viewer.page_child`."""
+    from sfms_robot.viewer import page_child  # only for the page's process
 
     page_child.main(lambda head, packages: scene_of(load_head(head, servos=False), packages))
 

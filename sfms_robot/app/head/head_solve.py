@@ -14,7 +14,7 @@ from sfms_robot.frames import Doubles
 from sfms_robot.retarget.head_retargeter import build_neck
 from sfms_robot.signals.face_tables import csv_cells, csv_numbers
 
-POSE_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m", "z_m")  # in the order of a pose
+POSE_COLUMNS = ("roll_rad", "pitch_rad", "yaw_rad", "x_m", "y_m", "z_m")  # columns in the order of a pose
 BODY_COLUMN = "body_yaw_rad"
 _FARTHEST = 1e6  # rad or m: squares must not overflow
 
@@ -22,9 +22,9 @@ log = logging.getLogger(__name__)
 
 
 def solve_poses(head_name: str, file: Path) -> Report:
-    """Solve every row of a CSV file, a pose that is held, for a head by name or folder.
+    """Solve every row of a CSV file, which is a pose that is held, for a head by name or folder.
 
-    Returns the joints of the neck, and for each pose their angles [rad], whether it is reached, and what is missing.
+    Returns the joints of the neck, and for each pose their angles [rad], whether it is reached, and the residual.
 
     Raises ConfigError for a head without a neck, and for a file that lacks a column, a row or a number.
     """

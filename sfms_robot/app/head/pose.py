@@ -1,7 +1,7 @@
 """`head pose`: one expression, or a few channels, on a head that otherwise rests.
 
-It is a run without a listener: the face rises, stays and falls on the timeline, and everything behind the timeline is
-that of a run, so the limits, the way in and the way to rest are the same.
+It is a run without a listener: the face rises, stays and falls on the timeline. Everything after the timeline is as in
+a run, so the limits, the way in and the way to rest are the same.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def parse_face(words: Sequence[str]) -> Floats:
 def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float, panel: Panel | None = None) -> Report:
     """Rise to the face of `words`, hold it, return to rest. Report how far each joint went, and unconfirmed torque.
 
-    Blocks until then. Raises any other RobotError, the head at rest.
+    Blocks until then. Raises any other RobotError, with the head at rest.
     """
     face, head = parse_face(words), load_head(options.head)
     furthest = Furthest(head)
@@ -98,9 +98,9 @@ def pose_head(options: HeadOptions, words: Sequence[str], hold_s: float, panel: 
 
 
 class FaceTrack:
-    """A `Timeline` through motion (K, 58) at rising times (K,), which takes no plans.
+    """A `Timeline` through motion (K, 58) at rising times (K,), which ignores plans.
 
-    Between two times it is linear, or a smooth step; before the first and after the last it stays.
+    Between two times it is linear, or a smooth step; before the first and after the last time it is constant.
     """
 
     def __init__(self, times_s: Doubles, motion: Floats, *, smooth: bool = False) -> None:
@@ -118,7 +118,7 @@ class FaceTrack:
         record: Path | None = None,
         observers: Sequence[Observer] = (),
     ) -> Report:
-        """Run once with this track in place of a person and a listener; return the report. `listener`: its name."""
+        """Run once with this track instead of a person and a listener; return the report. `listener`: its name."""
         alone = NobodyThere()
         chosen = RunOptions(
             **vars(options), listener=listener, duration_s=self.duration_s, record=record, overwrite=True
@@ -170,7 +170,7 @@ class NobodyThere(Source):
 
 
 class Furthest(Observer):
-    """An observer of how far from rest each joint was sent once the face began to rise, and how far it went."""
+    """An observer of how far from rest each joint was sent after the face began to rise, and how far it went."""
 
     def __init__(self, head: Head) -> None:
         self._joints = tuple(head.joints)
@@ -195,5 +195,5 @@ class Furthest(Observer):
 
 
 def _further(furthest: Doubles, now: Doubles) -> Doubles:
-    """Return whichever is further from 0, joint by joint; NaN counts as not known."""
+    """Return the value that is further from 0, joint by joint; NaN counts as unknown."""
     return np.where((np.abs(now) > np.abs(furthest)) | np.isnan(furthest), now, furthest)

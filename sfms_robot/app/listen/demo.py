@@ -22,7 +22,7 @@ from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import PageProcess
 
 FOLDER: Final = Path("runs", "demo")
-FACE: Final = "none"  # of the person, who is there by voice alone, which is what a microphone gives
+FACE: Final = "none"  # face of the person, of whom there is only the voice, as with a microphone
 PLOT, SHEET = "run.png", "head.png"
 _KEPT: Final = ("version", "exit", "exit_code", "error", "head", "listener", "seed", "duration_s")
 
@@ -32,9 +32,9 @@ def demo(
 ) -> Report:
     """Run once, record it, show it on a page or draw it. Raises RobotError.
 
-    Blocks for the length of the run and some seconds; with a page until the last visitor leaves it: another bundled
-    person talks meanwhile, then the next. Further runs are not recorded. Without the packages that a picture needs, it
-    is left out and `"missing"` names the pip install. `folder` None: a new one, `FOLDER` or the next free number.
+    Blocks for the length of the run and some seconds. With a page it blocks until the last visitor leaves, while one
+    bundled person talks after another. Further runs are not recorded. A picture whose packages are not installed is
+    left out, and `"missing"` has the pip command. `folder` None: a new one, `FOLDER` or the next free number.
     """
     folder = folder or free_folder(FOLDER)
     options = replace(options, audio=DEFAULT_SPEAKER, face=FACE, record=folder)
@@ -45,7 +45,7 @@ def demo(
         with page_session(page, options, choices=True) as pages:
             open_browser(page.url)
             report = pages.run(panel)
-            with suppress(KeyboardInterrupt):  # which ends the page; the head rests
+            with suppress(KeyboardInterrupt):  # Ctrl-C ends the page; the head is at rest
                 while pages.next(
                     stay=report["exit"] == "done" or pages.released,
                     speaker=next_speaker(pages.options.audio) if report["exit"] == "done" else None,
@@ -62,7 +62,7 @@ def demo(
     }
     if seen or report["exit"] == "failed" or not report["ticks"]:  # interrupted before it began: nothing to draw
         return shown
-    from sfms_robot.app.replay.pictures import replay_run  # scipy: not while servos move
+    from sfms_robot.app.replay.pictures import replay_run  # imports scipy: not while servos move
 
     try:
         for plot, sheet in ((folder / PLOT, None), (None, folder / SHEET)):
@@ -80,7 +80,7 @@ def next_speaker(speaker: str) -> str:
 
 
 def compare_seeds(options: RunOptions, seeds: int, each: Callable[[Report], None]) -> Report:
-    """Run seeds 0 to `seeds` - 1 one after the other, without recording; call `each` with each. Raises RobotError."""
+    """Run seeds 0 to `seeds` - 1 in turn, without recording; call `each` with each summary. Raises RobotError."""
     rows = []
     for seed in range(seeds):
         seeded = replace(options, audio=DEFAULT_SPEAKER, face=FACE, seed=seed)
@@ -98,7 +98,7 @@ def compare_seeds(options: RunOptions, seeds: int, each: Callable[[Report], None
 
 
 def nods_over_seeds(counts: Sequence[int]) -> dict[str, float | int | None]:
-    """Return mean, variance over mean (1 is Poisson's; None for one seed or no nod), and how many seeds have none."""
+    """Return mean, variance over mean (1: Poisson; None for one seed or no nod), and number of seeds without a nod."""
     mean = float(np.mean(counts))
     scatter = round(float(np.var(counts, ddof=1)) / mean, 2) if len(counts) > 1 and mean > 0 else None
     return {"mean": round(mean, 2), "variance_over_mean": scatter, "seeds_without": sum(one == 0 for one in counts)}

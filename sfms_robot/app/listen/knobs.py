@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sfms_robot.sources.net_person import PageVisitor
     from sfms_robot.sources.push import Spoken
 
-STEP: Final = 0.1  # of a key
+STEP: Final = 0.1  # change of intensity by one key press
 MOST: Final = 2.0
 
 
@@ -58,16 +58,16 @@ class Knob:
 
 
 class LiveKnobs:
-    """The regions of a head by name. May be set from any thread.
+    """The knobs of a head's regions by name. May be set from any thread.
 
     Args:
-        intensity, style: of `--intensity REGION=V` and `--style REGION=V`, which replace values of the head's file.
+        intensity, style: of `--intensity REGION=V` and `--style REGION=V`; they replace values of the head's file.
 
     Raises ConfigError for an unknown region or a value outside 0..2.
 
     Attributes:
-        values: region -> value, of "intensity" and of "style".
-        now: what the loop reads at every tick.
+        values: region -> value, for "intensity" and for "style".
+        now: the knobs that the loop reads at every tick.
     """
 
     def __init__(self, head: Head, intensity: Sequence[str] = (), style: Sequence[str] = ()) -> None:
@@ -80,20 +80,20 @@ class LiveKnobs:
         self.turn(values_by_name("--intensity", intensity), values_by_name("--style", style))
 
     def turn(self, intensity: Mapping[str, float], style: Mapping[str, float]) -> None:
-        """Set values of regions. Raises InputError, with nothing changed, for an unknown region or one outside 0..2."""
+        """Set values of regions. Raises InputError, changing nothing, for an unknown region or a value outside 0..2."""
         given = {"intensity": intensity, "style": style}
         with self._lock:
             values = {kind: {**self.values[kind], **regions} for kind, regions in given.items()}
             self.values, self.now = values, self._face.knobs(**values)
 
     def turn_all(self, by: float) -> None:
-        """Change the intensity of every region by `by`; none leaves 0..2."""
+        """Change the intensity of every region by `by`, within 0..2."""
         with self._lock:
             now = self.values["intensity"].items()
             self.turn({name: round(min(max(at + by, 0.0), MOST), 3) for name, at in now}, {})
 
     def __getitem__(self, region: str) -> Knob:
-        """Return a region. Raises InputError for a name that is not one."""
+        """Return the knob of a region. Raises InputError for an unknown region."""
         if region not in self.values["style"]:
             raise InputError(f"{region!r} is not a region of this head ({', '.join(self) or 'none'})")
         return Knob(self, region)
@@ -105,7 +105,7 @@ class LiveKnobs:
         return len(self.values["style"])
 
 
-# --- all that other threads may do to a run ---------------------------------------------------------------------------
+# --- commands on a run from other threads -----------------------------------------------------------------------------
 
 
 class RunControls:
@@ -115,10 +115,10 @@ class RunControls:
         interrupt: ends the run.
         halt: emergency stop.
         knobs: scale of each region.
-        puppet: faces over the listener's plan.
+        puppet: faces that replace the listener's plan for a while.
         calmness: rates of events.
-        set_rates: of the listener; None: not begun, or in virtual time.
-        visitor: the person in front of a page. speech: what a program lets the robot say.
+        set_rates: sets the rates of the listener; None: the listener has not begun, or time is virtual.
+        visitor: the person in front of a page. speech: the speech that a program lets the robot say.
         document: returns the status of the run; an empty one before it begins.
     """
 
@@ -139,6 +139,6 @@ class RunControls:
             self.set_rates(self.calmness)
 
     def release(self) -> None:
-        """Take torque off at once, as a second Ctrl-C does; the run ends with it."""
+        """Switch torque off at once, as a second Ctrl-C does; this also ends the run."""
         self.interrupt.ask()
         self.interrupt.ask()

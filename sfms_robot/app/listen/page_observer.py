@@ -1,7 +1,7 @@
-"""A run as its page receives it: its facts at the start, 25 pictures a second, events as they are decided, recordings.
+"""The data that a page receives of its run: facts at the start, 25 pictures a second, events when decided, recordings.
 
-The loop packs a picture's numbers and hands them over; they are turned into text in the page's process. Work of a
-millisecond, once a second, is done by a thread.
+The loop packs the numbers of a picture and passes them on; the page's process turns them into text. Work of a
+millisecond, once a second, is done in a thread.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ from sfms_robot.signals.audio import energy_db
 from sfms_robot.viewer.page_messages import NOTHING, VERSION, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
-TELL_S: Final = 1.0  # between two documents, and two looks for events in the plans of a listener that decides none
-LONGEST_S: Final = 300.0  # of one recording; what comes after it is left out
+TELL_S: Final = 1.0  # period of documents, and of searches for events in plans of a listener that decides none
+LONGEST_S: Final = 300.0  # longest recording; the rest is left out
 _WAITING: Final = 50  # plans that wait for the thread
 _EPS_FRAMES: Final = 1e-6
 
@@ -48,12 +48,12 @@ def page_facts(
     feeds: Collection[str] = (),
     choices: bool = False,
 ) -> Report:
-    """Return the `hello` of docs/reference/protocol.md, but for the entries that differ between visitors.
+    """Return the `hello` of docs/reference/protocol.md, except for the entries that differ between visitors.
 
     Args:
         speaker: name of the recorded person; None: a live person.
-        feeds: voice and face, if a visitor may bring them.
-        choices: another listener, speaker or seed may be chosen.
+        feeds: voice and face, if a visitor may provide them.
+        choices: True if another listener, speaker or seed may be chosen.
     """
     calmness = options.calmness or Calmness()
     return {
@@ -87,10 +87,10 @@ def page_facts(
 
 
 def people_per_minute(listener: str) -> dict[str, float]:
-    """Return events a minute by kind, as learned from people: the meaning of a rate of None. {}: none are decided.
+    """Return events a minute by kind, as learned from people, for rates of None; {} if no events are decided.
 
-    A listener of another package or machine may decide them; what it learned is not known here, so it is taken for a
-    shipped one. Raises ConfigError.
+    A listener of another package or machine may decide events. Its learned rates are not known here, so it is treated
+    as a shipped one. Raises ConfigError.
     """
     folder = listener_folder(listener)
     if folder is not None and not load_listener(folder / "config.yaml").events:
@@ -103,7 +103,7 @@ def _lines(rows: list[Report]) -> list[dict[str, str]]:
 
 
 class PageObserver(Observer):
-    """`ports.Observer` that shows a run on a page, which is closed by the code that opened it.
+    """`ports.Observer` that shows a run on a page. The code that opened the page closes it.
 
     Args:
         joints: names, in the order of `Tick.goals_rad`.
@@ -123,7 +123,7 @@ class PageObserver(Observer):
         self._told_s = -math.inf
         self._rare: tuple[Any, bytes] = (None, b"")
         self._plans = deque[Plan](maxlen=_WAITING)
-        self._events = PlannedEvents()  # of the thread that sends
+        self._events = PlannedEvents()  # used by the thread that sends
 
     def tick(self, seen: Tick) -> None:
         """Send a picture, 25 times a second, and once a second the state of the run."""
@@ -146,7 +146,7 @@ class PageObserver(Observer):
         self._own_db = NOTHING if frame.agent_audio is None else energy_db(frame.agent_audio)
 
     def planned(self, plan: Plan) -> None:
-        """Keep hazards, and have events sent."""
+        """Keep the hazards, and have the events sent."""
         self._plans.append(plan)
         self._hazards_hz = plan.hazards_hz
         if plan.events:
@@ -174,7 +174,7 @@ class PageObserver(Observer):
             self._page.say("event", **event_row(event), at_s=round(event.start_s, 3), evidence=evidence)
 
     def _read_rad(self, seen: Tick) -> Floats:
-        """Return (J,) angles; NaN without a recent one: legs of a platform read at other times fit no pose of now."""
+        """Return angles (J,), NaN without a recent one: platform legs read at other times fit no current pose."""
         read = (
             math.nan if each is None or each.position_rad is None or each.age_s > AWAY_S else each.position_rad
             for each in map(seen.readings.get, self._joints)
@@ -192,10 +192,10 @@ class PageObserver(Observer):
 
 
 class PageRecorder(Observer):
-    """`ports.Observer` that passes a run on to a `Recorder` while a visitor records. `record`: in the page's thread.
+    """`ports.Observer` that passes a run on to a `Recorder` while a visitor records. The page's thread calls `record`.
 
     Args:
-        folder: where recordings go, each into another folder.
+        folder: folder of the recordings, each of which gets a folder in it.
         about: see `Recorder`.
     """
 

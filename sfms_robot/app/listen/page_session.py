@@ -1,8 +1,8 @@
-"""A page and the runs behind it: one, or a series where visitors may choose listener, speaker and seed.
+"""A page and the runs behind it: one run, or a series if visitors may choose listener, speaker and seed.
 
-A visitor's choice brings the head to rest, and the next run begins with it; the page stays. Commands go through the
-limits of the head, as all motion does; a command that cannot be carried out raises a RobotError, which is sent to its
-visitor.
+After a visitor's choice, the head comes to rest and the next run begins with that choice; the page stays. Commands go
+through the limits of the head, as all motion does. A command that cannot be carried out raises a RobotError, which is
+sent to its visitor.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ from sfms_robot.sources.net_person import PageVisitor
 from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER
 from sfms_robot.viewer.page_process import PageProcess
 
-AWAY_S: Final = 5.0  # without visitors, after which the page is given up: one that is loaded again is back sooner
+AWAY_S: Final = 5.0  # time without visitors after which the page is given up; reloading a page takes less
 LEFT_S: Final = 30.0
-PAUSE_S: Final = 3.0  # at rest, before the next recorded person talks
-BY_PAGE: Final = "page"  # a cause of a halt, and the door that clears it
+PAUSE_S: Final = 3.0  # pause at rest before the next recorded person talks
+BY_PAGE: Final = "page"  # a cause of a halt, and the door that clears it (`runtime.halt`)
 _LOOK_S: Final = 0.5
 
 logger = logging.getLogger(__name__)
 
 
 class PageSession:
-    """One page, from `open_page` on, and what runs behind it. Carries out commands of visitors, in the page's thread.
+    """One page, from `page_session` on, and the runs behind it. Commands of visitors come in the page's thread.
 
     Args:
-        options: of the first run.
+        options: options of the first run.
         choices: visitors may choose another listener, speaker and seed, and be the person themselves.
 
     Attributes:
-        options: of the present run, or of the last one.
-        released: a visitor has ended that run.
+        options: options of the present run, or of the last one.
+        released: True if a visitor has switched torque off, which ended that run.
         reach: controls of the present run; None: there is none.
-        recorder: of that run.
+        recorder: recorder of that run.
     """
 
     def __init__(self, page: PageProcess, options: RunOptions, folder: Path, choices: bool) -> None:
@@ -66,7 +66,7 @@ class PageSession:
         self._visitor = PageVisitor()
         self._wanted: RunOptions | None = None
         self._further = False  # the present run is not the first
-        self._set: Report = {}  # options that visitors turned in the run that went on last
+        self._set: Report = {}  # options as visitors left them in the last run
         self._chosen = threading.Event()
         page.answered_by(self)
 
@@ -75,7 +75,7 @@ class PageSession:
     ) -> Report:
         """Run once, with `options`. Blocks until it is over; returns its report. Raises as `session.run`.
 
-        `feed`: a listener of these options that loads already.
+        `feed`: a listener of these options that is already loading.
         """
         options, head = self.options, load_head(self.options.head, servos=False)
         joints, by_visitor = list(head.joints), options.visitor_feeds
@@ -84,7 +84,7 @@ class PageSession:
         self._chosen.clear()
         watcher.document, controls.visitor = lambda: controls.document(), self._visitor
         with ExitStack() as stack:
-            scene = scene_of(head, options.packages)  # a picture that is broken is reported before anything moves
+            scene = scene_of(head, options.packages)  # a broken picture is reported before anything moves
             for line in scene.left_out:
                 logger.warning("picture of the head: %s", line)
             speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
@@ -110,17 +110,17 @@ class PageSession:
                 options, panel, feed=feed, observers=watchers, controls=controls,
                 more=lambda: {"page": self.page.statistics()},
             )  # fmt: skip
-        if report["exit"] == "interrupted" and lonely.ended:  # its proper end
+        if report["exit"] == "interrupted" and lonely.ended:  # the regular end of such a run
             report |= {"exit": "done", "exit_code": 0}
         if self._wanted is None:
             self.page.say("end", report=report)
         return report
 
     def next(self, stay: bool, speaker: str | None = None) -> bool:
-        """Return whether another run is to begin, now in `options`; what visitors turned stays turned.
+        """Return whether another run is to begin, and set `options` for it; settings of visitors are kept.
 
         `stay`: wait for a choice while there are visitors. Blocks until then, or until there are none for `AWAY_S`;
-        with a `speaker`, who talks where no visitor has chosen, for `PAUSE_S`.
+        with a `speaker`, which is used if no visitor has chosen, for `PAUSE_S`.
         """
         if stay and self.page.visited.is_set():
             stay_for_visitors(self.page, self._chosen, math.inf if speaker is None else PAUSE_S)
@@ -132,7 +132,7 @@ class PageSession:
         return True
 
     def _ended(self) -> None:
-        """Take the run out of reach, and keep what visitors turned in it."""
+        """Forget the controls of the run, and keep the settings that visitors changed in it."""
         reach, self.reach = self.reach, None
         assert reach is not None
         self._set = {kind: words_of(values) for kind, values in reach.knobs.values.items()}
@@ -176,7 +176,7 @@ class PageSession:
                 self.recorder.record(values["on"])
 
     def person(self, visitor: int, message: bytes) -> None:
-        """Take a piece of the voice, or a face, of the visitor that is the person. Raises PacketError."""
+        """Receive a piece of the voice, or a face, of the visitor that is the person. Raises PacketError."""
         self._visitor.received(visitor, message)
 
     def left(self, visitor: int) -> None:
@@ -186,7 +186,7 @@ class PageSession:
     def _choose(self, what: str, value: Any) -> None:
         if not self._choices:
             raise InputError(f"{what}: this run keeps what it was started with (`sfms-robot demo` lets you choose)")
-        # By name alone: a visitor reaches no folder of this machine, and no address of another.
+        # Only names are accepted, so a visitor cannot reach a folder of this machine or the address of another.
         offered = {"listener": list(self._listeners), "speaker": speaker_names()}.get(what)
         if offered is not None and value not in offered:
             raise InputError(f"{what} {value!r} is not there ({', '.join(offered)})")
@@ -207,7 +207,7 @@ class PageSession:
         self._visitor.came(visitor, feeds)
 
     def _want(self, changes: Facts) -> None:
-        """Ask for another run, with these options; the present one comes to rest."""
+        """Request another run with these options; the present run comes to rest."""
         self._wanted = replace(self._wanted or self.options, record=None, **changes)
         self._chosen.set()
         if self.reach is not None and not self.reach.interrupt():
@@ -216,10 +216,10 @@ class PageSession:
 
 @dataclass(kw_only=True, eq=False)
 class EndsAlone(Observer):
-    """Ends a run that has had no visitors for `left_s`.
+    """An observer that ends a run which has had no visitors for `left_s`.
 
     Attributes:
-        ended: it has done so.
+        ended: True if it has ended the run.
         seen_s: time of the last visitor.
     """
 
@@ -247,9 +247,9 @@ def stay_for_visitors(page: PageProcess, over: threading.Event, longest_s: float
 
 @contextmanager
 def page_session(page: PageProcess, options: RunOptions, choices: bool = False) -> Iterator[PageSession]:
-    """Run behind a page whose process has begun, while inside. Blocks until the page can be opened.
+    """Yield the session of a page whose process has begun. Blocks until the page can be opened.
 
-    Raises PortError, ConfigError where it cannot.
+    Raises PortError, ConfigError if it cannot be opened.
     """
     page.wait()
     logger.log(NOTE, "page: %s", page)

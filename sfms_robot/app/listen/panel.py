@@ -1,7 +1,7 @@
 """A panel of a run on the terminal: its status four times a second, and keys that halt, resume and end the run.
 
-The loop's thread does none of this: one thread draws, one reads keys, and log lines wait for the thread that draws.
-Nothing is shown where stderr is not a terminal, nor while another program has the terminal.
+None of this runs in the loop's thread: one thread draws, one reads keys, and log lines wait for the thread that draws.
+Nothing is shown if stderr is not a terminal, or while another program has the terminal.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ except ImportError:  # Windows
     termios = None  # type: ignore[assignment]
 
 PERIOD_S: Final = 0.25
-JOIN_S: Final = 1.0  # a terminal that is held (Ctrl-S) takes nothing: the run ends without it
-_QUIET_DB: Final = -60.0  # an empty meter; 0 is full scale
-_METER: Final = 20  # characters, fewer on a narrow terminal
+JOIN_S: Final = 1.0  # longest wait for a thread; a stopped terminal (Ctrl-S) blocks it, and the run ends without it
+_QUIET_DB: Final = -60.0  # level of an empty meter; 0 is full scale
+_METER: Final = 20  # width in characters, fewer on a narrow terminal
 _BEGINS: Final = {"frame_to_wire": "picture and sound", "speech_to_wire": "speech begins"}
-_FAULTS: Final = 4  # named; the others are counted
+_FAULTS: Final = 4  # most faults that are named; the others are counted
 _COLORS: Final[Mapping[str, str]] = {
     "starting": "cyan",
     "idle": "blue",
@@ -58,7 +58,7 @@ _HELP: Final = (
 )
 _NO_KEYS: Final = "no keys here: Ctrl-C ends the run"
 _ESCAPE: Final = "\x1b"
-_LOOK_S: Final = 0.2  # between two looks at whether this program has come to the foreground
+_LOOK_S: Final = 0.2  # period of the check whether this program has come to the foreground
 _LOCAL: Final = 3  # place in the list of `tcgetattr`
 
 
@@ -73,7 +73,7 @@ def live_panel(run: RunControls) -> Iterator[None]:
     found = Keyboard(sys.stdin.fileno()) if single else None
     with ExitStack() as stack:
         screen = stack.enter_context(_drawing(console, run, found is not None))
-        stack.enter_context(_suspending(screen, found))  # before the terminal is taken, until it is given back
+        stack.enter_context(_suspending(screen, found))  # from before the terminal is taken until it is restored
         if found is not None:
             stack.enter_context(reading_keys(found, lambda key: _pressed(key, screen, run)))
         yield
@@ -84,9 +84,9 @@ def _pressed(key: str, screen: _Screen, run: RunControls) -> None:
         run.halt.close("key")
     elif key == "r":
         resume_here(run.halt)
-    elif key == "q" and not run.interrupt():  # a key that is held down interrupts once, and releases nothing
+    elif key == "q" and not run.interrupt():  # a key that is held down interrupts once, and does not release torque
         run.interrupt.ask()
-    elif key in "+=-":  # "=": the key of "+", without shift
+    elif key in "+=-":  # "=" is the key of "+" without shift
         run.knobs.turn_all(-STEP if key == "-" else STEP)
     elif key == "?":
         screen.help = not screen.help
@@ -142,7 +142,7 @@ class _Screen:
 
 @contextmanager
 def _drawing(console: Console, run: RunControls, keys: bool) -> Iterator[_Screen]:
-    """Draw in a thread while inside. The thread erases too: a second Ctrl-C interrupts the main thread."""
+    """Draw in a thread while inside. The thread also erases, since a second Ctrl-C interrupts the main thread."""
     screen, over = _Screen(console, run, keys), threading.Event()
 
     def work() -> None:
@@ -267,13 +267,13 @@ def _level(level_db: float | None, width: int, console: Console) -> str:
 
 
 def level_bar(level_db: float, width: int, glyphs: str) -> str:
-    """Return a meter from -60 dB to full scale; `glyphs`: of its full and its empty part."""
+    """Return a meter from -60 dB to full scale; `glyphs`: the characters of its full and its empty part."""
     filled = round(width * min(1.0, max(0.0, 1.0 - level_db / _QUIET_DB)))
     return glyphs[0] * filled + glyphs[1] * (width - filled)
 
 
 def _intensity(regions: Mapping[str, float]) -> str:
-    """Return the regions whose intensity is not 1; one number where all are equal."""
+    """Return the regions whose intensity is not 1; one number if all are equal."""
     if len(regions) > 1 and len(set(regions.values())) == 1 and 1.0 not in regions.values():
         return f"{next(iter(regions.values())):g}"
     return ", ".join(f"{region} {value:g}" for region, value in regions.items() if value != 1.0)
@@ -304,7 +304,7 @@ def _faults(faults: Mapping[str, str]) -> str:
 
 
 class Keyboard:
-    """The terminal of a file descriptor: `take` for single keys, `give_back` for lines. From any thread.
+    """The terminal of a file descriptor: `take` it for single keys, `give_back` for lines. Usable from any thread.
 
     No Enter is needed, nothing is echoed, and the terminal is restored afterwards. It is in cbreak mode while this
     program is in its foreground, so Ctrl-C, Ctrl-\\ and Ctrl-Z stay signals. In the background the terminal belongs to
@@ -318,7 +318,7 @@ class Keyboard:
         self._lock = threading.RLock()  # a signal handler may interrupt the thread that holds it
 
     def take(self) -> bool:
-        """Switch to single keys; return False in the background. Called repeatedly: a shell may change the mode."""
+        """Switch to single keys; return False in the background. Called repeatedly: a shell may change it."""
         with self._lock:
             if self._left or in_background(self._fd):
                 return False
@@ -350,7 +350,7 @@ class Keyboard:
     def wait(self, over: int) -> str | None:
         """Block until keys are pressed or `_LOOK_S` is over; return the keys, or "". None once `over` is readable.
 
-        A sequence of several bytes (an arrow, Alt with a key) counts as the Esc that it begins with, and as that alone.
+        A sequence of several bytes (an arrow, Alt with a key) counts as a single Esc, with which it begins.
         """
         ready, _, _ = select.select([over, self._fd] if self.take() else [over], [], [], _LOOK_S)
         if over in ready:
@@ -362,7 +362,7 @@ class Keyboard:
 
 
 def in_background(fd: int) -> bool:
-    """Return whether the terminal `fd` belongs to another program now. False where it belongs to no shell."""
+    """Return whether the terminal `fd` belongs to another program now. False if no shell controls it."""
     try:
         return hasattr(os, "tcgetpgrp") and os.tcgetpgrp(fd) != os.getpgrp()
     except OSError:
@@ -383,7 +383,7 @@ def reading_keys(found: Keyboard, pressed: Callable[[str], object]) -> Iterator[
             return
 
     thread = threading.Thread(target=work, name="keys", daemon=True)
-    try:  # from here on: a signal may end the program before the first key
+    try:  # begins here, since a signal may end the program before the first key
         thread.start()
         yield
     finally:

@@ -1,4 +1,4 @@
-"""The report of a run (`run --json`), the facts in its recording, and the messages to the programs it works with.
+"""The report of a run (`run --json`), the facts in its recording, and its messages to other programs.
 
 Every figure of the report is from the run's own log, the bus's counters or the listener.
 """
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from sfms_robot.app.open_head import OpenHead
     from sfms_robot.outputs.sender import Outputs
 
-LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # texts that are not for one line
+LONG: Final = ("joints", "head_yaml", "listener_config", "options")  # facts that are too long for one line
 # The head, its port and how the drive ended: keys of every report.
 OUTCOME: Final = ("version", "head", "port", "exit", "exit_code", "error", "torque_unconfirmed")
 _KINDS: Final = {kind.exit_code: kind for kind in (ConfigError, PortError, BusError, ModelError)}
@@ -41,13 +41,13 @@ _KINDS: Final = {kind.exit_code: kind for kind in (ConfigError, PortError, BusEr
 def run_report(
     opened: OpenHead, log: RunLog, feed: PlanFeed, outcome: str, elapsed_s: float | None, error: Exception | None
 ) -> Report:
-    """Return version 1 of the report of a drive without a listener; a run adds its own.
+    """Return version 1 of the report of a drive without a listener; a run adds its own entries.
 
     Args:
-        outcome: "done", "interrupted" or "failed", and then there is an `error`.
-        elapsed_s: of the drive; None in virtual time, where wall-clock figures are null.
+        outcome: "done", "interrupted", or "failed" together with an `error`.
+        elapsed_s: duration of the drive; None in virtual time, where wall-clock figures are null.
     """
-    code = 0 if error is None else getattr(error, "exit_code", 1)  # of the process: see `errors`
+    code = 0 if error is None else getattr(error, "exit_code", 1)  # exit code of the process, see `errors`
     heard = dict(feed.statistics())
     timeline, limiter = (getattr(log.state, part, None) for part in ("timeline", "limiter"))
     plans = _counts(timeline, ("held", "eased", "late", "refused"))
@@ -87,7 +87,7 @@ def run_report(
 
 
 def failure(report: Report) -> RobotError | None:
-    """Return the error that ended a run, by its report; None for a run that was not ended by one."""
+    """Return the error that ended a run, from its report; None if no error ended it."""
     if report["exit"] != "failed":
         return None
     return _KINDS.get(report["exit_code"], RobotError)(report["error"])
@@ -102,7 +102,7 @@ def figures_so_far(
     outputs: Outputs,
     more: Document,
 ) -> Report:
-    """Return the figures of the report that are known while it runs, under the report's names. From any thread."""
+    """Return the figures of the report that are known during the run, by the report's names. From any thread."""
     passed_s = log.listened_s + (1 + log.eased) * log.period_s
     return {
         **_loop_figures(opened, log, None if opened.options.fast else passed_s),
@@ -116,7 +116,7 @@ def figures_so_far(
 
 
 def _loop_figures(opened: OpenHead, log: RunLog, elapsed_s: float | None) -> Report:
-    """Return the figures of the loop; those of the wall clock are null without one (`elapsed_s` None)."""
+    """Return the figures of the loop; wall-clock figures are null in virtual time (`elapsed_s` None)."""
     measured = log.late_ms, log.frame_to_wire_ms, log.speech_to_wire_ms
     late_ms, frame_ms, speech_ms = [Quantiles()] * 3 if elapsed_s is None else measured
     return {
@@ -146,8 +146,8 @@ def _counts(state: object, names: Names) -> dict[str, int]:
 def run_facts(head: Head, options: RunOptions) -> dict[str, str]:
     """Return the facts that a recording keeps of its run, text by text, for `Recorder(about=...)`.
 
-    `head_yaml` is the head as it was used, calibration included, and a head's file itself. Of a listener that is a
-    folder there are its configuration and the SHA-256 of its weights.
+    `head_yaml` is the head as it was used, calibration included, in the form of a head's file. For a listener that is
+    a folder, the facts include its configuration and the SHA-256 of its weights.
     """
     calmness = options.calmness and options.calmness.model_dump(exclude_none=True)
     values = {**asdict(options), "audio": options.hears, "calmness": calmness}
@@ -170,7 +170,7 @@ def run_facts(head: Head, options: RunOptions) -> dict[str, str]:
 def _listener_facts(name: str) -> dict[str, str]:
     try:
         folder = listener_folder(name)
-    except ConfigError:  # an object of a program's own
+    except ConfigError:  # the listener is an object of the calling program
         folder = None
     if folder is None:
         return {}
@@ -184,7 +184,7 @@ def _listener_facts(name: str) -> dict[str, str]:
 def limitation(listener: str) -> str | None:
     """Return the channels that a listener, by name or folder, shows on no head, as one line; None if there are none.
 
-    None too for a listener of another package. Raises ConfigError.
+    Also None for a listener of another package. Raises ConfigError.
     """
     folder = listener_folder(listener)
     return None if folder is None else MotionSpace.of(load_listener(folder / "config.yaml"), folder).limitation
@@ -217,7 +217,7 @@ class OutletObserver(EventWatch):
 
 
 def event_row(event: ListenerEvent) -> Report:
-    """Return an event as it is sent to programs and pages, but for its time."""
+    """Return an event in the form that is sent to programs and pages, except for its time."""
     return {
         "event": event.kind,
         "lasts_s": round(event.duration_s, 3),

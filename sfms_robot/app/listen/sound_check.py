@@ -1,4 +1,4 @@
-"""The quality of the sound for a head, with a level meter meanwhile: `run --audio mic --check`. No servo is touched."""
+"""A check of the sound for a head, with a level meter: `run --audio mic --check`. No servo is touched."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from sfms_robot.signals.audio import energy_db
 from sfms_robot.sources.registry import open_source
 
 CHECK_S: Final = 3.0
-CLIPPED: Final = 0.99  # of full scale
-MOST_CLIPPED: Final = 1e-3  # of the samples
-QUIET_DB: Final = -45.0  # of full scale; speech of a person at arm's length is at -35 to -15
+CLIPPED: Final = 0.99  # share of full scale
+MOST_CLIPPED: Final = 1e-3  # share of the samples
+QUIET_DB: Final = -45.0  # relative to full scale; speech of a person at arm's length is at -35 to -15
 NOISY_DB: Final = 10.0  # speech closer to the noise than this is hard to understand
 SILENT_DB: Final = -95.0  # quieter than any room or microphone
-_NOISE_PERCENT, _SPEECH_PERCENT = 10, 95  # of the frames, by their level
+_NOISE_PERCENT, _SPEECH_PERCENT = 10, 95  # percentiles of the frames, by their level
 _POLL_S: Final = 0.01
 _WIDTH: Final = 40
 _LOUD_DB: Final = -12.0
@@ -34,9 +34,9 @@ _LOUD_DB: Final = -12.0
 def check_sound(
     audio: str, duration_s: float | None = None, on_level: Callable[[float, bool], None] | None = None
 ) -> Report:
-    """Listen to `audio` (as `run --audio`) for `duration_s` (`CHECK_S`), in real time, and judge it; see `judge_sound`.
+    """Listen to `audio` (as `run --audio`) for `duration_s` (`CHECK_S`), in real time, and return `judge_sound` of it.
 
-    `on_level` is called for every frame with its level [dB of full scale] and whether it clips. Raises an error of the
+    `on_level` is called for every frame with its level [dB of full scale] and whether it clips. Raises errors of the
     source; ConfigError for "none".
     """
     if audio == "none":
@@ -57,7 +57,7 @@ def check_sound(
 
 
 def judge_sound(frames: Sequence[Floats]) -> Report:
-    """Judge frames (640,), which are empty where nothing came.
+    """Judge the quality of frames (640,); an empty frame is a missing one.
 
     Returns seconds, missing_frames, level_dbfs (of the loudest part: speech), noise_floor_dbfs, peak, clipped (share of
     the samples) and findings: a line for each problem.

@@ -1,8 +1,8 @@
 """Pictures of a recorded run: a plot over time, and a contact sheet of twelve instants.
 
 The plot (extra `plots`) shows voice, head pose, six face channels, the neck, and every other joint as a coloured band.
-The sheet (extra `pictures`) shows the virtual head, and beside it the robot: the largest nod from its top over its
-lowest point to its end, the firmest blink, the broadest smile, the furthest look aside; the rest are spread in between.
+The sheet (extra `pictures`) shows the virtual head, and next to it the robot: the largest nod from its top over its
+lowest point to its end, the strongest blink, smile and look aside; the other instants are spread in between.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _DPI: Final = 100
 _PHRASE, _VOICE = "#f4e9d2", "#a8772c"
 _COLORS: Final = ("#1f6f9c", "#c8553d", "#5b8c5a", "#8b6bb1", "#c29a2e", "#3f8f8b")
 _NECK_JOINTS: Final = 3
-# Joints come from where they stood when torque came on: left out of the scale of the neck's panel.
+# The joints first move in from where they stood when torque came on: left out of the scale of the neck's panel.
 _COMING_IN_S: Final = 1.0
 _LEAST_SCALE_DEG: Final = 1.0  # a joint that hardly moves stays pale
 
@@ -60,7 +60,7 @@ _STATES: Final = {
     "stopping": "#b8d4e3",
 }
 _EVENTS: Final = {"nod": "v", "blink": "|", "smile": "^"}
-_LEAST_LABEL: Final = 0.04  # of the width: a state that is shorter has its color alone
+_LEAST_LABEL: Final = 0.04  # share of the width; a shorter state has a color but no label
 
 # Signals of a face: the mean of channels, less the mean of others. The plot has a lane for each of the first six.
 _SIGNALS: Final = {
@@ -75,7 +75,7 @@ _SIGNALS: Final = {
 }
 _LESS: Final = {"gaze left +": ("eyeLookInLeft", "eyeLookOutRight")}
 _LANES: Final = list(_SIGNALS)[:6]
-# What a sheet writes below an instant: signal, direction, the least that counts (rad for turn and tilt), label.
+# Labels below an instant of a sheet: signal, direction, least value that counts (rad for turn and tilt), label.
 _LABELS: Final = (
     ("blink", 1, 0.45, "blink"),
     ("smile", 1, 0.25, "smile"),
@@ -88,11 +88,11 @@ _LABELS: Final = (
     ("tilt", 1, np.radians(5.0), "tilts"),
     ("tilt", -1, np.radians(5.0), "tilts"),
 )
-_SEEN_ONLY: Final = ("jaw open", "tilt")  # these are named where they are seen, and get no picture of their own
+_SEEN_ONLY: Final = ("jaw open", "tilt")  # these are labelled where they occur, and get no picture of their own
 
 
 def replay_run(folder: Path, plot_png: Path | None, sheet_png: Path | None) -> Report:
-    """Draw the pictures that are wanted; return a summary of the recording. Raises ConfigError, MissingExtra."""
+    """Draw the requested pictures; return a summary of the recording. Raises ConfigError, MissingExtra."""
     pictures = (plot_png, "--plot", plot), (sheet_png, "--sheet", sheet)
     wanted = [(checked_png(png, option), draw) for png, option, draw in pictures if png is not None]
     recording = read_recording(folder)
@@ -141,7 +141,7 @@ def _states(axes: Axes, recording: RunRecording) -> None:
 
 
 def _voice(axes: Axes, recording: RunRecording) -> None:
-    """Draw the envelope of the sound: the least and the most of every hundredth of a second."""
+    """Draw the envelope of the sound: minimum and maximum of every hundredth of a second."""
     piece = AUDIO_HZ // 100
     pieces = recording.audio[: len(recording.audio) // piece * piece].reshape(-1, piece)
     if len(pieces):
@@ -201,7 +201,7 @@ def _neck(axes: Axes, recording: RunRecording) -> None:
 
 
 def _heat(axes: Axes, recording: RunRecording) -> None:
-    """Draw every other joint as a band: its goal from its median, red up and blue down, full at its furthest."""
+    """Draw every other joint as a band: its goal from its median, red up and blue down, full color at the furthest."""
     neck = _neck_joints(recording)
     joints = [n for n in range(len(recording.joints)) if n not in neck]
     axes.grid(visible=False)
@@ -235,7 +235,7 @@ _PANELS: Final = (  # height, title, and the function that draws it
 
 
 def pick_instants(times_s: Doubles, motion: Floats) -> dict[int, str]:
-    """Return what happens at twelve rows of a motion (N, 58), in order, by row. Raises ValueError when N = 0."""
+    """Return the labels of twelve rows of a motion (N, 58), by row, in order. Raises ValueError when N = 0."""
     if not len(times_s):
         raise ValueError("a sheet needs at least one frame")
     signals = {name: _signal(motion, name) for name in _SIGNALS}
@@ -262,7 +262,7 @@ def _signal(motion: Floats, name: str) -> Floats:
 
 
 def _nods(times_s: Doubles, motion: Floats) -> list[tuple[int, int, int]]:
-    """Return the rows at which nods begin, are lowest and end. Up and back is a look, not a nod."""
+    """Return the rows at which nods begin, are lowest and end. A move up and back is a look, not a nod."""
     if len(times_s) < 2:
         return []
     pitch, rate_hz = motion[:, CHANNEL_INDEX["pitch"]], 1.0 / float(np.median(np.diff(times_s)))
@@ -275,7 +275,7 @@ def _nods(times_s: Doubles, motion: Floats) -> list[tuple[int, int, int]]:
 
 
 def _peaks(signals: dict[str, Floats]) -> list[int]:
-    """Return the strongest instant of each kind of event that occurs; all but the blink with open eyes, to see it."""
+    """Return the strongest instant of each kind of event that occurs; except for the blink, with open eyes."""
     least = {name: least for name, _, least, _ in _LABELS if name not in _SEEN_ONLY}
     rows = []
     for name in least:
@@ -287,7 +287,7 @@ def _peaks(signals: dict[str, Floats]) -> list[int]:
 
 
 def _loneliest(times_s: Doubles, rows: Sequence[int]) -> int:
-    """Return the row furthest in time from those chosen; the middle of the run when there is none."""
+    """Return the row that is furthest in time from the chosen rows; the middle of the run when none is chosen."""
     if not rows:
         return len(times_s) // 2
     away_s = np.abs(times_s[:, None] - times_s[rows]).min(axis=1)
@@ -301,7 +301,7 @@ def _loneliest(times_s: Doubles, rows: Sequence[int]) -> int:
 def sheet(recording: RunRecording, png: Path | str) -> dict[int, str]:
     """Draw virtual head and robot at twelve instants: the face of the listener, the servos. Return the instants.
 
-    A head that is not at hand, has other joints now or names no URDF is left out. Raises MissingExtra without vtk.
+    The robot is left out if its head is not available or has other joints now. Raises MissingExtra without vtk.
     """
     vtk, scene, motion = drawing.load_vtk(), None, recording.motion
     with suppress(ConfigError):
@@ -325,7 +325,7 @@ def sheet(recording: RunRecording, png: Path | str) -> dict[int, str]:
             ends = x0, low / size[1], x1, (low + cell_high) / size[1]
             cells.append(drawing.add_renderer(vtk, window, ends, drawing.BACKGROUND))
         drawing.add_head(vtk, cells[0], human, motion[row])
-        drawing.look(cells[0], (1.07, 0.36, 0.07), (0.012, 0.0, 0.020), 17.4)  # from a little to its left
+        drawing.look(cells[0], (1.07, 0.36, 0.07), (0.012, 0.0, 0.020), 17.4)  # from a little to the left of the head
         if scene is not None:
             drawing.add_robot(vtk, cells[1], scene, scene.values(angles_rad[row].astype(np.float64)))
         drawing.add_text(vtk, paper, f"{recording.times_s[row]:.2f} s", (left + 4, low - 26), 19).SetBold(True)

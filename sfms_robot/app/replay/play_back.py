@@ -1,8 +1,8 @@
-"""A recorded run played again: by a head, or on a page where no head moves.
+"""Playback of a recorded run: by a head, or on a page where no head moves.
 
-A head plays the recorded face, not the recorded joint angles, through the retargeter and limits of the head at hand: so
-one recording suits every head, and neither another calibration nor another servo can take a joint where it must not go.
-Torque comes on and goes off as in `sfms-robot run`; there is no listener, and nothing is added to the recording.
+A head plays the recorded face, not the recorded joint angles, through its own retargeter and limits. So one recording
+suits every head, and a joint cannot go where it must not, even with another calibration or another servo. Torque comes
+on and goes off as in `sfms-robot run`; there is no listener, and nothing is added to the recording.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_messages import NOTHING, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
-FAULTY: Final = "faulty"  # the name of every fault: a recording has only whether there was one
+FAULTY: Final = "faulty"  # the name of every fault: a recording only has whether there was one
 
 
 def recorded_face(recording: RunRecording) -> FaceTrack:
@@ -49,7 +49,7 @@ def play_back(
     fast: bool = False,
     yes: bool = False,
 ) -> Report:
-    """Drive a head as long as the recording lasts, also one that was cut off. Block until then; return a report.
+    """Drive a head for the length of a recording, which may have been cut off. Block until the end; return a report.
 
     `head` None: the recorded one, by its shipped name. Raises RobotError before torque came on; after that the head is
     at rest, and "error" says why.
@@ -73,9 +73,9 @@ def play_back(
 
 
 def show_recording(folder: Path, page: PageProcess) -> None:
-    """Put the run in `folder` on a page whose process has begun. Blocks until it is there.
+    """Show the run in `folder` on a page whose process has begun. Blocks until it is shown.
 
-    Raises ConfigError for a folder without one, and where the recorded head is not at hand or has other joints now.
+    Raises ConfigError for a folder without a run, and if the recorded head is not available or has other joints now.
     """
     recording = read_recording(folder)
     about, speaker = recording.about, recording.about.get("audio")

@@ -1,4 +1,4 @@
-"""Read DIR/run.mcap, and the files that continue it, into arrays; a file that was cut off up to where it ends."""
+"""Read DIR/run.mcap, and the files that continue it, into arrays. A file that was cut off is read up to its end."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _PAUSE_FRAMES = 5  # a silence shorter than 0.2 s does not end a phrase
 _FLOOR_DB, _BELOW_LOUD_DB = -50.0, 27.0
 _FRAME_BYTES = 2 * FRAME_SAMPLES
 
-_Rows = defaultdict[str, list[Any]]  # by topic
+_Rows = defaultdict[str, list[Any]]  # rows by topic
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,18 +42,18 @@ class RunRecording:
     Attributes:
         about: facts of the run (head, listener, seed, ...).
         joints: (J,) names.
-        times_s: (N,) of the ticks. motion: (N, 58) the face asked for.
+        times_s: (N,) times of the ticks. motion: (N, 58) the requested face.
         goals_rad, present_rad: (N, J) float32; present is NaN where nothing was read within `AWAY_S`.
-        faults: (N, J) a named fault is there.
+        faults: (N, J) True where there is a named fault.
         heard_s: (M,) ends of the speaker's frames. audio: (M * 640,) zeros where there was none.
-        agent_audio: (M * 640,) voice of the head itself, sample by sample beside `audio`; None where the recording has
-            none.
+        agent_audio: (M * 640,) voice of the head itself, aligned with `audio` sample by sample; None if it was not
+            recorded.
         energy_db: (M,). speaker: (M, 58) NaN where no face was seen.
-        plans: how many the listener made.
+        plans: number of plans of the listener.
         states: (time_s, name, why) of every change, in order.
-        events: (start_s, kind) of the nods, blinks and smiles that plans held.
-        hottest_C: of all servos; None where none reported a temperature.
-        whole: the file has its end.
+        events: (start_s, kind) of the nods, blinks and smiles in the plans.
+        hottest_C: highest temperature of all servos; None if none reported one.
+        whole: True if the file has its end.
     """
 
     about: Mapping[str, str]
@@ -118,7 +118,7 @@ class RunRecording:
 
 
 def read_recording(folder: Path | str) -> RunRecording:
-    """Read what `run --record` wrote. Raises ConfigError, in one line, when there is nothing that can be read."""
+    """Read the recording that `run --record` wrote. Raises ConfigError, in one line, if nothing can be read."""
     parts = parts_of(Path(folder))
     if not parts:
         what = f"has no {RUN_FILE}" if Path(folder).is_dir() else "is no folder"
@@ -136,10 +136,10 @@ def read_recording(folder: Path | str) -> RunRecording:
                 else:
                     rows[topic].append(_row(topic, body, joints))
     except (EndOfFile, struct.error):
-        whole = False  # it was cut off
+        whole = False  # the file was cut off
     except McapError as error:
         raise ConfigError(f"{file}: not a recorded run: {error}") from error
-    except Exception as error:  # a broken chunk: each compressor has errors of its own
+    except Exception as error:  # a broken chunk: each compressor has its own exceptions
         raise ConfigError(f"{file}: damaged: {error}") from error
     if not rows["/face"] or not rows["/joints"]:
         raise ConfigError(f"{file}: holds no tick: " + ("the run never began" if whole else "the file is cut off"))
@@ -169,7 +169,7 @@ def summary(recording: RunRecording) -> Report:
 def _records(file: Path) -> Iterator[tuple[str, Any]]:
     """Yield (topic, body), ("about", metadata) and, when the file has one, ("end", None).
 
-    Of the format "ros2" the JSON texts are read; what ROS's own types repeat of them is left out.
+    In the format "ros2" the JSON texts are read; messages of ROS's own types, which repeat parts of them, are left out.
     """
     topics = {}
     in_ros2 = False
@@ -189,7 +189,7 @@ def _records(file: Path) -> Iterator[tuple[str, Any]]:
 
 
 def _row(topic: str, body: Any, joints: Sequence[str]) -> Any:
-    """Return what is kept of a message: numbers in arrays, since messages take twenty times as much memory.
+    """Return the part of a message that is kept: numbers in arrays, since messages take twenty times as much memory.
 
     None becomes NaN.
     """
@@ -209,7 +209,7 @@ def _row(topic: str, body: Any, joints: Sequence[str]) -> Any:
             return body["time_s"], body["state"], tuple(body["why"])
         case "/event":
             return body["start_s"], body["kind"]
-        case "/servos":  # of all that is reported, the temperatures
+        case "/servos":  # only the temperatures are kept
             return [each["temperature_C"] for each in body["servos"].values() if each.get("temperature_C") is not None]
     return None  # a plan: only counted
 
@@ -231,7 +231,7 @@ def _arrays(rows: _Rows, about: Mapping[str, str], joints: Names, whole: bool) -
         faults=faults != 0,
         heard_s=np.array(heard_s),
         audio=_sound(sound),
-        # A frame holds the robot's sound after it: the sound of the frame itself is in the one before.
+        # A frame holds the robot's sound of the time after it: the sound during a frame is in the frame before.
         agent_audio=_sound([None, *said[:-1]]) if any(said) else None,
         energy_db=np.array(energy_db),
         speaker=np.array(faces, np.float32).reshape(-1, MOTION_DIM),

@@ -1,16 +1,16 @@
 """One process of `sfms-robot serve`: a `StreamServer`, its model, and the one thread that steps its batches.
 
-Most of what a frame costs is Python, so a core is a process: threads of one would wait for one another. All times are
-`time.monotonic`, which processes of one machine share.
+Most of the cost of a frame is Python code, so each core has a process: threads of one process would wait for one
+another. All times are `time.monotonic`, which processes of one machine share.
 
-    parent -> child    a `Served`, then an int: the hop, which it waits for; then
+    parent -> child    a `Served`, then an int: the hop, for which the child waits; then
         (stream, message, came_s)    for one of its streams
         (None, message, number)      a request for a stream
         int                          a request for figures, by that number
     child -> parent    (kind, value)
-        loaded     the hop that a robot would choose by what a plan takes here; it waits for its hop
+        loaded     the hop that a robot would choose for the duration of a plan here; the child waits for its hop
         ready      its `Capacity`: it serves
-        clients    {stream: client} whenever those that it holds have changed; before the answer that names a new one
+        clients    {stream: client} whenever its streams have changed; before the answer that names a new stream
         answer     (number, message) to a request for a stream
         send       [(stream, message)]
         figures    (number, `Figures`)
@@ -37,7 +37,7 @@ from sfms_robot.processes import ParentPipe
 
 LEAD_S: Final = 0.080  # longest lead of a joint, for the hop that a robot would choose
 TICK_S: Final = 0.010
-LOOK_S: Final = 1.0  # between two looks for streams that went away
+LOOK_S: Final = 1.0  # period of the search for streams that have gone
 
 Say = Callable[[tuple[str, Any]], None]
 
@@ -46,15 +46,15 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Served:
-    """A listener that is served, and how.
+    """A listener that is served, and the settings of the service.
 
     Attributes:
         listener: shipped name or folder.
-        name: by which robots request it.
+        name: name by which robots request it.
         server: name of this server.
-        engine: what computes its networks; device: where.
-        hop: None for the one that a robot would choose by what a plan takes here.
-        all_heads: admit all, whatever they cost.
+        engine: engine of its networks. device: device of the engine.
+        hop: None for the hop that a robot would choose for the duration of a plan here.
+        all_heads: admit all heads, whatever they cost.
     """
 
     listener: str
@@ -70,7 +70,7 @@ def main() -> None:
     """Load, measure, then serve until the pipe ends."""
     parent, inbox = ParentPipe(), queue.SimpleQueue[Any]()
     served: Served = parent.receive()
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # of a service manager that stops all processes: the parent ends this
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a service manager sends it to all; the parent ends this process
     parent.forward(inbox.put)
     try:
         from sfms_robot.listeners.registry import at_hop, hops_of, load_listener
@@ -99,7 +99,7 @@ def main() -> None:
 
 
 def _serve(server: StreamServer, inbox: queue.SimpleQueue[Any], say: Say) -> None:
-    """Take messages and step what is due, without end."""
+    """Receive messages and step the batches that are due, without end."""
     held: Mapping[str, str] = {}
     while True:
         messages: list[tuple[str, bytes]] = []
@@ -126,7 +126,7 @@ def _serve(server: StreamServer, inbox: queue.SimpleQueue[Any], say: Say) -> Non
 
 
 def _stepped(server: StreamServer) -> list[tuple[str, bytes]]:
-    """Step one batch and return its messages; none where no frame waits, and where the listener fails."""
+    """Step one batch and return its messages; none if no frame waits, or if the listener fails."""
     batch = server.batch()
     if batch is None:
         return []
@@ -145,7 +145,7 @@ def _stepped(server: StreamServer) -> list[tuple[str, bytes]]:
 
 
 def _waiting(inbox: queue.SimpleQueue[Any], limit_s: float) -> list[Any]:
-    """Return all messages that came; wait for the first one for so long."""
+    """Return all messages that have come; wait up to `limit_s` for the first one."""
     items = []
     try:
         if limit_s:

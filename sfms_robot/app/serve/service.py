@@ -1,11 +1,11 @@
 """`sfms-robot serve`: a listener for many heads, over zenoh (`listeners.remote` has the keys).
 
-The processes that step (`batch_process`) are one for each core; streams are dealt among them. A request for a stream
-goes to the process with the fewest; its frames go there until it leaves. Weights are in memory once for each. A process
-that dies while it serves is reported and started again: robots whose streams it had receive that they are unknown, and
-join again.
+Each core has one process that steps batches (`batch_process`); streams are distributed among the processes. A request
+for a stream goes to the process with the fewest streams, and its frames go there until it leaves. Each process has the
+weights in memory. A process that dies while it serves is reported and started again: robots whose streams it had are
+notified that they are unknown, and join again.
 
-Messages come in threads of zenoh's, and are passed on to the processes.
+Messages arrive in threads of zenoh, and are passed on to the processes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from sfms_robot.viewer.web_server import LocalServer
 
-FIGURES_LIMIT_S: Final = 2.0  # for the figures of a process; later, its last ones count
+FIGURES_LIMIT_S: Final = 2.0  # longest wait for the figures of a process; after that its last ones are used
 CLOSE_LIMIT_S: Final = 1.0
 
 Send = Callable[[str, bytes], None]
@@ -48,7 +48,7 @@ Reply = Callable[[bytes], None]
 
 log = logging.getLogger(__name__)
 
-# Name, what it says, where in the statistics of `StreamServer`; those in seconds are in milliseconds there.
+# Name, description, and key in the statistics of `StreamServer`, where times are in milliseconds instead of seconds.
 _GAUGES: Final = (
     ("heads", "Heads that are listened for", "heads"),
     ("heads_most", "Heads that could be answered in time", "most_heads"),
@@ -72,20 +72,20 @@ _COUNTERS: Final = (
 
 
 class WorkerPool:
-    """Messages in, plans out. Serves from construction, which blocks for some seconds, until `close`.
+    """The processes of a server: messages in, plans out. Serves from construction (some seconds) until `close`.
 
     Args:
-        served: the listener, and how.
+        served: the listener, and how it is served.
         send: sends one message to one stream; called from any of the pool's threads, must not block.
-        processes: None for one for each core.
+        processes: number of processes; None: one for each core.
 
     Attributes:
         hop: frames from one plan to the next, the same for all.
         capacities: costs of batches in each process, measured while all were at work.
-        most: heads that are answered within the deadline.
-        problem: why it cannot continue; None as long as it can.
+        most: number of heads that are answered within the deadline.
+        problem: reason why it cannot continue; None as long as it can.
 
-    Raises ConfigError for an unknown listener or hop, ModelError for one that cannot be loaded.
+    Raises ConfigError for an unknown listener or hop, ModelError for a listener that cannot be loaded.
     """
 
     def __init__(self, served: Served, send: Send, processes: int | None = None) -> None:
@@ -119,10 +119,10 @@ class WorkerPool:
     def join(self, message: bytes, reply: Reply) -> None:
         """Pass on a request for a stream. From any thread.
 
-        `reply` is called from one of the pool's threads, or never: a robot without an answer asks again.
+        `reply` is called from one of the pool's threads, or never: a robot without an answer sends its request again.
         """
         client = None
-        with suppress(PacketError):  # which the process refuses
+        with suppress(PacketError):  # the process refuses the message
             if isinstance(words := parse_words(message), Join):
                 client = words.client
         with self._changed:
@@ -147,7 +147,7 @@ class WorkerPool:
         return report(self._figures)
 
     def close(self) -> None:
-        """End the processes, whatever they compute. Idempotent."""
+        """End the processes, even while they compute. Idempotent."""
         with self._changed:
             self._closing = True
         for each in self._workers:
@@ -177,7 +177,7 @@ class WorkerPool:
                 case "figures":
                     worker.counted, worker.figures = value
                 case "loaded":
-                    self.hop = self.hop or value  # of the first: it measured while nothing else was at work
+                    self.hop = self.hop or value  # the first process measured it while no other was at work
                     worker.child.send(self.hop)
                 case "ready":
                     worker.capacity = value
@@ -190,7 +190,7 @@ class WorkerPool:
             reply(value[1])
 
     def _replace(self, worker: _Worker, code: int) -> None:
-        """Start another process in place of one that has ended; one that never served is a problem."""
+        """Start another process in place of one that has ended; set `problem` if that process never served."""
         if self._closing:
             return
         if worker.capacity is None:
@@ -203,13 +203,13 @@ class WorkerPool:
 
 
 class _Worker:
-    """One process.
+    """One process of the pool.
 
     Attributes:
         capacity: None until it serves.
-        clients: of its streams, by stream.
-        requests: for a stream, without an answer yet, by number: the client, and how to reply.
-        figures: the newest, requested by the number `counted`.
+        clients: clients of its streams, by stream.
+        requests: unanswered requests for a stream, by number: the client, and the function that replies.
+        figures: the newest figures, requested by the number `counted`.
     """
 
     def __init__(self, served: Served, take: Callable[[_Worker, Any], None]) -> None:
@@ -238,7 +238,7 @@ def serve(
     """Serve until `over` is set, and return the figures. Blocks until then.
 
     Args:
-        served: the listener, and how.
+        served: the listener, and how it is served.
         over: ends the service.
         say: prints a line for people.
         router: zenoh's configuration; None: loopback.

@@ -1,4 +1,4 @@
-"""Problems of a port, a servo or a bus, and what to type against them: facts in, findings out. Opens nothing.
+"""Problems of a port, a servo or a bus, and commands that solve them: facts in, findings out. Opens nothing.
 
 Three severities: an `error` stops the head from running, a `warning` makes it run worse or not for long, a `note` is
 good to know or is corrected by the run itself.
@@ -31,7 +31,7 @@ Severity = Literal["error", "warning", "note"]
 SEVERITIES: Final = ("error", "warning", "note")
 DEFAULT_RATE_HZ: Final = 100.0
 FAST_ENOUGH_MS: Final = 1
-_ROUND: Final = 0.95  # a bus that reaches this share of its rate reaches it
+_ROUND: Final = 0.95  # share of its rate from which a bus counts as reaching it
 _POLOLU: Final = "1ffb"
 _BOARD_HELP: Final = {
     "maestro": "use the first of its two USB ports (command port) with serial mode USB Dual Port or USB Chained, or "
@@ -39,17 +39,17 @@ _BOARD_HELP: Final = {
     "mode, and Enable CRC, which has to be what `crc` of the bus says",
     "ssc32": "set the board's baud jumpers to the baud of the head's file; an SSC-32U leaves the factory at 9600",
 }
-_HOT_C: Final = 10  # this close to its limit a servo is about to switch off
+_HOT_C: Final = 10  # a servo this close to its limit is about to switch off
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing found.
+    """A finding about a port, a bus or a servo.
 
     Attributes:
-        about: The port, bus or servo it concerns, for people.
-        fix: What to type or do, empty where there is nothing to do; `{id}` stands for the servo's id.
-        servo: Its id, where it concerns one servo.
+        about: Name of the port, bus or servo, for people.
+        fix: Command to type or action to take, empty if there is none; `{id}` stands for the servo's id.
+        servo: Id of the servo, if the finding is about one servo.
     """
 
     severity: Severity
@@ -60,7 +60,7 @@ class Finding:
     servo: int | None = None
 
     def plain(self) -> Report:
-        """Return it for a report."""
+        """Return the finding as plain data for a report."""
         return {key: value for key, value in asdict(self).items() if key != "servo"}
 
 
@@ -69,9 +69,9 @@ class Wanted:
     """One servo as the head's file describes it.
 
     Attributes:
-        model_number: None where it cannot be checked.
-        faults: The faults that the head acts upon.
-        needs: The values that its joint needs the servo to have stored.
+        model_number: None if it cannot be checked.
+        faults: The faults to which the head reacts.
+        needs: The stored values that its joint requires.
     """
 
     joint: str
@@ -81,14 +81,14 @@ class Wanted:
     needs: JointNeeds | None = None
 
     def lives_with(self, fault: str, state: ServoState) -> bool:
-        """Return whether the head's file says that this fault does not count."""
+        """Return whether the head's file ignores this fault."""
         measured = {"input voltage": state.in_unit("voltage"), "overheating": state.in_unit("temperature")}
         return not counts(fault, self.faults, measured)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Line:
-    """One port to look at, and what is expected on it.
+    """One port to examine, and the servos that are expected on it.
 
     Attributes:
         shown: Its name in commands.
@@ -112,23 +112,23 @@ class Line:
 
     @property
     def is_terminal(self) -> bool:
-        """It is a pseudo terminal of an emulator, which has the port open too, and no adapter."""
+        """True for a pseudo terminal of an emulator, which also has the port open and has no adapter."""
         return os.path.realpath(self.device).startswith("/dev/pts/")
 
     @property
     def fix(self) -> str:
-        """The command that mends stored values against the head's file."""
+        """The command that corrects stored values as the head's file requires."""
         return f"sfms-robot doctor --port {quote(self.ports or self.shown)}{self._of_head or self._of_family} --fix"
 
     def servo(self, words: str, baud: int | None = None) -> str:
         """Return a `servo` command for this port."""
         rate = f" --baud {baud}" if baud is not None else ""
-        # Which emulated servos there are, and at what rate, is their head's to say.
+        # The head determines which emulated servos there are, and their rate.
         which = self._of_head if self.shown == SIM and self.head else f"{rate}{self._of_family}"
         return f"sfms-robot servo {words} --port {quote(self.shown)}{which}"
 
     def name(self, servo: int) -> str:
-        """Return a servo with its joint, for people."""
+        """Return the name of a servo with its joint, for people."""
         return f"id {servo} ({self.wanted[servo].joint})" if servo in self.wanted else f"id {servo}"
 
     @property
@@ -144,7 +144,7 @@ class Line:
 
 
 def judge_port(path: str, problem: str, group: str, ports: Sequence[SerialDevice]) -> Finding:
-    """Return the problem of a path that cannot be opened as a port, with its cure."""
+    """Return the problem of a path that cannot be opened as a port, with its fix."""
     there = ", ".join(each.by_id or each.path for each in ports)
     fix = f"use one of: {there}" if there else "plug the adapter in; `dmesg | tail` says whether it was recognised"
     if is_address(path):
@@ -170,7 +170,7 @@ def _holders(severity: Severity, path: str, held_by: Sequence[Holder], too: str)
 
 
 def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[Finding]:
-    """Yield the problems of an open port: other programs that use it, and how long it holds bytes back."""
+    """Yield the problems of an open port: other programs that use it, and an adapter that delays answers."""
     yield from _holders("warning", device.path, held_by, " too")
     if device.latency_ms is not None and device.latency_ms > FAST_ENOUGH_MS:
         fix = f"echo 1 | sudo tee {device.latency_file}  (until it is unplugged; for good: the udev rule below)"
@@ -178,10 +178,10 @@ def judge_adapter(device: SerialDevice, held_by: Sequence[Holder]) -> Iterator[F
 
 
 def udev_rule(device: SerialDevice) -> str | None:
-    """Return lines of a udev rule that last: the latency timer, and a name for this adapter.
+    """Return the lines of a permanent udev rule: the latency timer, and a name for this adapter.
 
     None for a port that is not a USB adapter. An adapter without a serial number is named by its USB socket, since two
-    of a kind would share a name; `ID_PATH_TAG` is set by 60-serial.rules of systemd, which come before 99.
+    adapters of one kind would share a name; `ID_PATH_TAG` is set by 60-serial.rules of systemd, which come before 99.
     """
     if device.vendor is None or device.product is None:
         return None
@@ -202,7 +202,7 @@ def judge_presence(line: Line, found: Iterable[FoundServo], baud: int, hint: str
     """Yield ids of the head that are silent, at another rate, or of another model; and ids that the head does not name.
 
     Args:
-        found: Servos that answer, at whatever rate.
+        found: Servos that answer, at any rate.
         baud: The head's rate.
         hint: The protocol to which servos answer instead.
     """
@@ -221,7 +221,7 @@ def judge_presence(line: Line, found: Iterable[FoundServo], baud: int, hint: str
             fix = line.servo(f"set-baud {{id}} {baud}", seen.baud)
         elif want.model_number is not None and seen.model_number not in (None, want.model_number):
             said = f"the head says {want.model} ({want.model_number})"
-            number = f" ({seen.model_number})" if seen.table is not None else ""  # an unknown model has it already
+            number = f" ({seen.model_number})" if seen.table is not None else ""  # else the model's name contains it
             problem = f"{seen.model}{number} answers, {said}"
             fix = "two cables swapped, or the head's file names the wrong model or id"
         else:
@@ -260,7 +260,7 @@ def judge_servo(state: ServoState, line: Line) -> Iterator[Finding]:
 
 
 def _health(state: ServoState, table: Table, want: Wanted | None, line: Line) -> Judged:
-    """Yield what a servo's firmware, faults, supply and temperature say."""
+    """Yield the problems of a servo's firmware, faults, supply and temperature."""
     seen, (first, last) = state.seen, table.firmware
     if seen.firmware and not first <= seen.firmware <= last and table.family == "dynamixel":
         problem = f"firmware {seen.firmware} has no map of its own, that of {first}..{last} is used"
@@ -290,9 +290,9 @@ def _health(state: ServoState, table: Table, want: Wanted | None, line: Line) ->
 
 
 def _stored(state: ServoState, table: Table, want: Wanted | None, line: Line) -> Judged:
-    """Yield settings that slow a bus down, and stored values that are not what the joint needs.
+    """Yield settings that slow a bus down, and stored values that contradict the needs of the joint.
 
-    Without a head, values are compared with one another.
+    Without a head, the values are compared with one another.
     """
     seen, severities = state.seen, {"refused": "error", "set": "note", "told": "warning"}
     delay, level = table.role("return_delay"), table.role("status_level")
@@ -306,7 +306,7 @@ def _stored(state: ServoState, table: Table, want: Wanted | None, line: Line) ->
         yield "note", "torque is on", ""
     for each in stored_contradictions(state, want):
         severity, fix = cast(Severity, severities[each.then]), ""
-        if each.in_file and want is None:  # no head's file that it could contradict
+        if each.in_file and want is None:  # there is no head's file to contradict
             severity = "warning"
         elif each.fixable and not each.in_file and seen.registers()[each.register].writable:
             fix = line.servo(f"write {{id}} {each.register} {each.wanted}", seen.baud)
@@ -346,23 +346,23 @@ def wire_budget(
     together: bool = True,
     crc: bool = False,
 ) -> Report:
-    """Return the budget of a bus: bytes, ms and Hz of a tick that writes goals, and of one that reads every servo too.
+    """Return the budget of a bus: bytes, ms and Hz of a tick that writes goals, and of one that also reads all servos.
 
-    `plain` is one sync read, or one read after the other where the family has none, and None of a board; `fast` one
-    fast sync read, None where there is no such thing.
+    `plain` has one sync read, or one read after the other if the family has no sync read; it is None for a board.
+    `fast` has one fast sync read; it is None if the servos do not support that.
 
         tick = 10 bits x bytes / baud + return delay of every answer + latency of the adapter of every request answered
 
-    Servos that cannot be read together are asked one by one, and each request costs the adapter's latency again: that
-    is what makes factory settings slow.
+    Servos that cannot be read together are read one by one, and each request costs the adapter's latency again. This
+    makes factory settings slow.
 
     Args:
-        servos: Their number; of a board the channels, every one written every tick.
+        servos: Number of servos; for a board the number of channels, all of which are written in every tick.
         return_delay_us: The pause of a servo before it answers.
-        latency_ms: How long the adapter holds bytes back from the host.
+        latency_ms: Time for which the adapter holds bytes back from the host.
         read_bytes, write_bytes: Data per servo and tick; by default no reads, and a goal of the family.
-        together: False where the servos cannot answer one sync read.
-        crc: One more byte for every channel of a board.
+        together: False if the servos cannot answer one sync read.
+        crc: Add one byte for every channel of a board.
     """
     framing = FRAMINGS[family]
     goals = framing.goals(servos, write_bytes) + crc * servos
@@ -387,7 +387,7 @@ def wire_budget(
 
 
 def judge_rate(budget: Report, line: Line, fast_works: bool | None = None) -> Iterator[Finding]:
-    """Yield a finding where goals and answers of all servos do not fit into a tick."""
+    """Yield a finding if the goals and answers of all servos do not fit into a tick."""
     usual, least_hz = budget["plain"] or budget["write_only"], _ROUND * line.rate_hz
     if usual["hz"] >= least_hz:
         return
@@ -422,7 +422,7 @@ def judge_rate(budget: Report, line: Line, fast_works: bool | None = None) -> It
 
 
 def judge_board(family: str, channels: int, problem: str | None, device: SerialDevice) -> Iterator[Finding]:
-    """Yield what can be said of a bus of hobby servos. `problem`: of what answers on its port (`board_problem`)."""
+    """Yield the findings about a bus of hobby servos. `problem`: of the board on its port (`board_problem`)."""
     if problem is not None:
         yield Finding("error", "bus", problem, _BOARD_HELP[family])
     elif device.vendor == _POLOLU and device.path.startswith("/dev/ttyACM"):
@@ -435,7 +435,7 @@ def judge_board(family: str, channels: int, problem: str | None, device: SerialD
 
 
 def grouped(findings: Iterable[Finding]) -> list[Finding]:
-    """Return findings, worst first; the same problem of several servos is one finding, and its fix one command."""
+    """Return findings, worst first. The same problem of several servos becomes one finding with one command."""
     same: dict[object, list[Finding]] = {}
     for finding in findings:
         alike = (finding.severity, finding.problem, finding.fix) if finding.servo is not None else id(finding)
@@ -449,5 +449,5 @@ def grouped(findings: Iterable[Finding]) -> list[Finding]:
 
 
 def ids_text(ids: Sequence[int]) -> str:
-    """Return ids as the servo commands take them: `1,5-9`."""
+    """Return ids as the servo commands accept them: `1,5-9`."""
     return ",".join(str(run[0]) if len(run) == 1 else f"{run[0]}-{run[-1]}" for run in consecutive(ids))

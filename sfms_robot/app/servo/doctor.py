@@ -1,4 +1,4 @@
-"""`sfms-robot doctor`: look at a port, its adapter and every servo on it, and say what to do. Reads only, but to fix.
+"""`sfms-robot doctor`: examine a port, its adapter and every servo on it, and suggest fixes. Writes only to fix.
 
 Without a head it reports which servos answer, at every rate. With a head it also reports servos that are missing, at
 another rate, of another model or not in the file, and whether the bus reaches the head's rate.
@@ -58,10 +58,10 @@ from sfms_robot.servo.port import OpenPort, SerialPort
 from sfms_robot.servo.registers import Table, span_of
 
 FINE, PORT_FAILED, BUS_FAILED = 0, PortError.exit_code, ServoError.exit_code
-DEFAULT_HEAD: Final = "face28"  # whose servos are emulated
+DEFAULT_HEAD: Final = "face28"  # head whose servos are emulated
 DEFAULT_FAMILY: Final = "dynamixel2"
 _USB_MS: Final = 1.0  # an adapter without a latency timer of its own still waits for the next USB frame
-_BOARD_S: Final = 0.2  # a board answers at once; 9600 baud and a USB adapter take the rest
+_BOARD_S: Final = 0.2  # longest wait for a board, which answers at once; 9600 baud and a USB adapter take the rest
 _READ: Final = ("present_position", "present_speed", "present_load", "present_current")
 
 
@@ -73,10 +73,10 @@ def examine(
     progress: Progress = no_progress,
     fix: Confirm | None = None,
 ) -> Report:
-    """Look at every bus of a head, or at one port; return the report, whose `exit_code` is that of the command.
+    """Examine every bus of a head, or one port; return the report, whose `exit_code` is that of the command.
 
-    `family` (None: dynamixel2) and `baud` (None: every rate) are of a port alone: a head's file has both of each bus.
-    `fix` is asked before each stored value that can be mended without harm is; None mends nothing.
+    `family` (None: dynamixel2) and `baud` (None: every rate) are for a port without a head: a head's file has both for
+    each bus. `fix` must confirm each correction of a stored value that can be corrected safely; None corrects nothing.
 
     Raises ConfigError for a head, a family or a port description that cannot be used.
     """
@@ -104,7 +104,7 @@ def examine(
 def examine_line(
     line: Line, open_port: OpenPort, progress: Progress = no_progress, fix: Confirm | None = None
 ) -> Report:
-    """Look at one port; return a report with `adapter`, `servos`, `budget`, `fixed`, `findings`, `exit_code`."""
+    """Examine one port; return a report with `adapter`, `servos`, `budget`, `fixed`, `findings`, `exit_code`."""
     path, problem = line.device, access_problem(line.device)
     report: Report = {"bus": line.bus, "port": line.shown, "device": path, "family": line.family}
     report |= {"adapter": None, "udev_rule": None, "servos": [], "budget": None, "fixed": []}
@@ -142,13 +142,13 @@ def _finished(report: Report, findings: Iterable[Finding], failed: int = BUS_FAI
     return {**report, "findings": [each.plain() for each in together], "counts": counts, "exit_code": code}
 
 
-# --- what to look at ------------------------------------------------------------------------------------------------
+# --- the lines to examine -------------------------------------------------------------------------------------------
 
 
 def _lines(
     port: str | None, head: str | None, family: str, baud: int | None, stack: ExitStack
 ) -> Iterator[tuple[Line, OpenPort]]:
-    """Yield the lines to look at; the ports of a head are opened as its run opens them."""
+    """Yield the lines to examine; the ports of a head are opened as its run opens them."""
     clock = RealClock()
     if head is None:
         device = port or only_port()
@@ -161,7 +161,7 @@ def _lines(
     described = load_head(head)
     where = stack.enter_context(open_wires(described, port or only_port()))
     if port != SIM:
-        described = layered(described, load_overlay(described), head_hash(head)).head  # as it was measured
+        described = layered(described, load_overlay(described), head_hash(head)).head  # with its measured calibration
     for name, each in where.items():
         bus, device = described.buses[name], each if isinstance(each, str) else each.device
         open_port: OpenPort = partial(SerialPort, device, bus.baud, clock, bus.rs485)
@@ -199,7 +199,7 @@ def _lines(
 def _look(
     line: Line, wire: Wire, adapter: SerialDevice, progress: Progress, fix: Confirm | None
 ) -> tuple[list[Finding], Report]:
-    """Return findings and facts that need the open port."""
+    """Return the findings and facts for which the port must be open."""
     baud, found = _present(wire, line, progress)
     findings = list(judge_presence(line, found, baud, "" if found else protocol_hint(other_wires(wire))))
     fixed: list[str] = []
@@ -248,9 +248,9 @@ def _look(
 
 
 def _present(wire: Wire, line: Line, progress: Progress) -> tuple[int, Sequence[FoundServo]]:
-    """Return the line's rate, or the one that most servos have, and the servos, those at this rate first.
+    """Return the line's rate, or the rate of most servos, and the servos, those at this rate first.
 
-    With a head, other rates are looked at only for ids that are missing.
+    With a head, other rates are tried only for ids that are missing.
     """
     if line.baud is None and not line.wanted:
         every = scan(wire, None, progress)
@@ -258,7 +258,7 @@ def _present(wire: Wire, line: Line, progress: Progress) -> tuple[int, Sequence[
         usual = max(rates, key=rates.__getitem__, default=wire.baud)
         return usual, sorted(every, key=lambda seen: seen.baud != usual)
     wanted = list(line.wanted)
-    found = _at_this_rate(wire, line, wanted) or _at_this_rate(wire, line, wanted)  # one lost packet hides no bus
+    found = _at_this_rate(wire, line, wanted) or _at_this_rate(wire, line, wanted)  # twice: a packet may get lost
     for step, _ in enumerate(wire.reachable()):
         missing = [servo for servo in line.wanted if servo not in found]
         if not missing:
@@ -271,7 +271,7 @@ def _present(wire: Wire, line: Line, progress: Progress) -> tuple[int, Sequence[
 
 
 def _at_this_rate(wire: Wire, line: Line, ids: Sequence[int]) -> dict[int, FoundServo]:
-    """Return the servos that answer a broadcast, where there is one, and those of `ids` that answer a ping."""
+    """Return the servos that answer a broadcast, if the family has it, and those of `ids` that answer a ping."""
     found = {seen.id: seen for seen in wire.answering()} if wire.kind.broadcast else {}
     if found or not wire.kind.broadcast:
         for servo in ids:
@@ -282,10 +282,10 @@ def _at_this_rate(wire: Wire, line: Line, ids: Sequence[int]) -> dict[int, Found
 
 
 def _fix(state: ServoState, line: Line, confirm: Confirm) -> list[str]:
-    """Write what can be mended without harm, each confirmed and verified; return what was done.
+    """Correct stored values that can be corrected safely, each confirmed and verified; return what was done.
 
-    A value that zero and direction depend on goes into the head's file, never into the servo. Raises ConfigError for a
-    file that cannot be written, ServoError for a servo that has torque on, or does not take a value.
+    A value on which zero and direction depend is written to the head's file, never to the servo. Raises ConfigError for
+    a file that cannot be written, ServoError for a servo that has torque on, or does not accept a value.
     """
     seen, want, done = state.seen, line.wanted.get(state.seen.id), []
     for each in stored_contradictions(state, want):
@@ -303,7 +303,7 @@ def _fix(state: ServoState, line: Line, confirm: Confirm) -> list[str]:
         seen.guard(change, lambda question: True)
         if (field := seen.named(each.register)).writable:
             seen.put(field, each.wanted)
-        else:  # its position is brought into one turn; the shaft stays where it is
+        else:  # the reported position is brought into one turn; the shaft does not move
             link = cast(Dynamixel2Link, seen.wire.link)
             answer = link.clear_turns(seen.id)
             if answer is None or (refusal := link.refusal(answer)):
@@ -313,7 +313,7 @@ def _fix(state: ServoState, line: Line, confirm: Confirm) -> list[str]:
 
 
 def _fast_read_works(wire: Wire, members: Sequence[ServoState]) -> bool | None:
-    """Try a fast read on the servos themselves, which is surer than a table of firmware numbers."""
+    """Return whether a fast read works on the servos (None: not tried); a table of firmware numbers is less certain."""
     if wire.family != "dynamixel2" or not members:
         return None
     field = members[0].seen.registers().role("present_position")
@@ -327,5 +327,5 @@ def _fast_read_works(wire: Wire, members: Sequence[ServoState]) -> bool | None:
 def _servo_row(state: ServoState, line: Line) -> Row:
     want = line.wanted.get(state.seen.id)
     measured = state.measured(1, voltage_V="voltage", temperature_degC="temperature", return_delay_us="return_delay")
-    row = {key: value for key, value in state.seen.row().items() if key != "family"}  # the bus has it
+    row = {key: value for key, value in state.seen.row().items() if key != "family"}  # the report of the bus has it
     return {**row, "joint": want and want.joint, **measured, **state.health()}

@@ -1,7 +1,7 @@
-"""`sfms-robot emulate`: servos to plug software into, without servos.
+"""`sfms-robot emulate`: emulated servos that other software can use without hardware.
 
-Changes to the servos before the host comes are given for ids of a wire: `stored` 3,5-7:min_position_limit=1900 (raw
-values of registers), `starts` 3=4150 (the position it reads, ticks; beyond a limit or one turn, too).
+Servos can be changed by their ids before the host connects: `stored` 3,5-7:min_position_limit=1900 sets raw values of
+registers, `starts` 3=4150 sets the position that a servo reports (ticks; it may be beyond a limit or one turn).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def emulators(
     if (head is None) == (servo is None):
         raise ConfigError("emulate needs either --head NAME or --servo MODEL:IDS[,MODEL:IDS...]")
     if head is not None:
-        from sfms_robot.app.wiring import plugged_in  # brings numpy and all that drives a head: a list needs none
+        from sfms_robot.app.wiring import plugged_in  # imports numpy and more, which a list does not need
 
         wires = plugged_in(load_head(head))
     else:
@@ -106,7 +106,7 @@ def until_stopped(chains: Mapping[str, Chain]) -> None:
 
 
 def _change(option: str, text: str, wires: Collection[list[EmulatedServo]]) -> None:
-    """Carry an option out. Raises ConfigError for a bad one, and for ids of no servo."""
+    """Apply an option to the servos. Raises ConfigError for an invalid option, and for ids that no servo has."""
     found = _CHANGE.fullmatch(text.strip())
     if found is None or (found["register"] is None) != (option == "start"):
         raise ConfigError.at("emulate", option, text, f"cannot be read: {_FORMS[option]}")
@@ -148,7 +148,7 @@ def parse_servos(text: str) -> list[EmulatedServo]:
 
 
 def _faults(texts: Sequence[str]) -> list[str]:
-    """Return specs unchanged, and those of a file: one in a line, `#` starts a comment."""
+    """Return specs unchanged, and the specs in files: one per line, `#` starts a comment."""
     out: list[str] = []
     for text in texts:
         lines = Path(text).read_text().splitlines() if Path(text).is_file() else [text]

@@ -1,4 +1,4 @@
-"""The firmware maps as a whole: a list, and a check that the files agree with one another.
+"""All firmware maps together: a list, and a check that the files agree with one another.
 
 Mistakes within a map are found when it is loaded (`config.firmware`); this check compares several maps.
 """
@@ -57,7 +57,7 @@ def list_maps(more: Iterable[Path] = ()) -> list[Report]:
 
 
 def _expand(more: Iterable[Path]) -> list[Path]:
-    """Return files, and those in folders. Raises ConfigError for a folder without any."""
+    """Return the files, and all maps in the folders. Raises ConfigError for a folder without maps."""
     files = []
     for path in more:
         found = sorted(path.glob("**/*.yaml")) if path.is_dir() else [path]
@@ -68,7 +68,7 @@ def _expand(more: Iterable[Path]) -> list[Path]:
 
 
 def _names(loaded: Loaded) -> Iterator[MapProblem]:
-    """Yield maps whose model is not their file's name, by which they are found, or is that of another map."""
+    """Yield maps whose model differs from the file's name, by which maps are found, or is also that of another map."""
     first: dict[str, Path] = {}
     for file, each in loaded.items():
         if each.model != file.stem:

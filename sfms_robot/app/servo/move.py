@@ -1,4 +1,4 @@
-"""`servo move`: one servo, gently, and left as it was found. `servo release`: torque off, whatever its state."""
+"""`servo move`: move one servo gently, and restore its settings. `servo release`: torque off, in any state."""
 
 from __future__ import annotations
 
@@ -26,20 +26,21 @@ from sfms_robot.servo.stored_settings import JointNeeds
 
 SPEED_DEG_S: Final = 20.0
 STEP_S: Final = 0.02
-BEHIND_DEG: Final = 8.0  # farther behind its goal than this, something is in the way
+BEHIND_DEG: Final = 8.0  # lag behind the goal beyond which something is in the way
 SETTLE_S: Final = 1.0
-CLOSE_DEG: Final = 1.5  # a loaded servo without integral gain stops that short
+CLOSE_DEG: Final = 1.5  # a loaded servo without integral gain stops this far from its goal
 
 
 def move(seen: FoundServo, to: str | None, by: str | None) -> Row:
-    """Move a servo to a place or by a way: raw ticks, or degrees of its shaft as `-5deg`.
+    """Move a servo to a position or by a distance: raw ticks, or degrees of its shaft such as `-5deg`.
 
-    Its own profile is limited and its goal goes in steps of at most `SPEED_DEG_S`. Torque comes on as at startup, where
-    the servo stands; outside its own limits it cannot hold there, and its profile moves it inside first, as slowly.
-    Torque and profile are put back afterwards, also after Ctrl-C. Blocks for as long as the way takes, and `SETTLE_S`.
+    The servo's own profile is limited, and its goal moves in steps of at most `SPEED_DEG_S`. Torque comes on as at
+    startup, where the servo stands. Outside its own limits it cannot hold there, and its profile first moves it inside,
+    equally slowly. Torque and profile are restored afterwards, also after Ctrl-C. Blocks until the motion is over, and
+    up to `SETTLE_S` more.
 
-    Raises ConfigError for a goal outside its limits, ServoError for one that is not in position mode, refuses, or does
-    not get there; it then stops where it is.
+    Raises ConfigError for a goal outside its limits, ServoError for a servo that is not in position mode, refuses, or
+    does not reach the goal; it then stops where it is.
     """
     table, clock = seen.registers(), seen.wire.port
     goal_field, present, torque = (seen.named(n) for n in ("goal_position", "present_position", "torque_enable"))
@@ -58,7 +59,7 @@ def move(seen: FoundServo, to: str | None, by: str | None) -> Row:
         if not stays_on:
             goal = finish(startup.torque_on(), lambda pause_s: clock.wait_until(clock.now_s() + pause_s))
             stays_on = was_on
-        if speed is not None:  # twice that of the steps, so that the servo keeps up with them and does no more
+        if speed is not None:  # twice the speed of the steps, so that the servo keeps up with them
             raw = round(2.0 * _ticks(table, SPEED_DEG_S) / table.in_ticks(speed))
             seen.put(speed, min(speed.high, max(1, raw)))
         due_s = clock.now_s()
@@ -75,7 +76,7 @@ def move(seen: FoundServo, to: str | None, by: str | None) -> Row:
     finally:
         if not stays_on:
             _torque_off(seen, torque)
-        for field, usual in profile.items():  # last: under torque, a servo that is not where its goal is would jump
+        for field, usual in profile.items():  # last: with torque on, a servo away from its goal would jump
             seen.put(field, usual)
     return {"id": seen.id, "from": start, "to": target, "reached": reached}
 
@@ -116,7 +117,7 @@ def _check_mode(seen: FoundServo) -> None:
 
 
 def _torque_off(seen: FoundServo, torque: Field) -> None:
-    """Switch torque off, also when Ctrl-C comes meanwhile. Raises TorqueError where the servo does not confirm it."""
+    """Switch torque off, even if Ctrl-C comes meanwhile. Raises TorqueError if the servo does not confirm it."""
     try:
         seen.put(torque, 0)
     except KeyboardInterrupt:
@@ -143,22 +144,22 @@ def _ticks(table: Table, degrees: float) -> float:
 
 # --- release ----------------------------------------------------------------------------------------------------
 
-Unconfirmed = dict[int, str]  # by id: why it is not known that its torque is off; empty if it is off
+Unconfirmed = dict[int, str]  # by id: reason why torque is not confirmed off; empty if it is off
 
 SILENT: Final = "does not answer; torque off was sent"
 
 
 def release_head(name: str, port: str, everything: bool) -> list[Row]:
-    """Take torque off the servos of a head on `port`, as `release`."""
+    """Switch torque off on the servos of a head on `port`, as `release` does."""
     head = load_head(name)
     with open_wires(head, port) as opened:
         return release(head, opened, RealClock(), everything)
 
 
 def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) -> list[Row]:
-    """Take torque off the servos of a head, and write nothing else; return a row per joint.
+    """Switch torque off on the servos of a head, and write nothing else; return a row per joint.
 
-    The servos need not be those that the head's file names. `everything`: also servos and channels of other ids.
+    The servos may differ from those in the head's file. `everything`: also servos and channels with other ids.
     Joints on a bus whose port fails are unconfirmed. Raises PortError and BusError if no bus could be used.
     """
     rows, failures = [], []
@@ -189,8 +190,8 @@ def release(head: Head, opened: Opened, clock: Clock, everything: bool = False) 
 def release_chain(wire: Wire, tables: Mapping[int, Table], everything: bool) -> Unconfirmed:
     """Write torque off to the servos of `tables`, by id, until they confirm it. Raises BusError when the port fails.
 
-    A servo that answers a ping is written where the model that it names keeps its torque, a silent one where the head
-    says: it may still obey. Models of Protocol 1.0 all keep it in one place.
+    A servo that answers a ping is written at the torque register of the model that it reports; a silent servo, which
+    may still obey, at that of the head's file. All models of Protocol 1.0 have this register at the same address.
     """
     seen = {each.id: each for each in (scan(wire) if everything else ())}
     why = dict.fromkeys((*tables, *seen), SILENT)

@@ -1,7 +1,7 @@
-"""One serial line as the servo tools see it: any family, any rate, servos known by what they report.
+"""A serial line for the servo tools: any family, any rate, servos identified by their reports.
 
-Of the servos that the tools meet nothing is certain, neither rate nor id nor model. So a `Wire` can change its rate,
-looks for a servo at every rate its family has, and picks the firmware map by the model number it reads.
+The tools cannot assume the rate, the id or the model of a servo. So a `Wire` can change its rate, searches for a servo
+at every rate of its family, and selects the firmware map by the model number that the servo reports.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sfms_robot.servo.port import Port, SerialPort
 from sfms_robot.servo.registers import Field, Table
 
 Confirm = Callable[[str], bool]
-Row = Report  # of a table, and of --json
+Row = Report  # row of a table, and of --json
 
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms, an emulator is late on a busy computer
 TRIES: Final = 3
@@ -40,8 +40,8 @@ class FoundServo:
 
     Attributes:
         table: Its control table; None for a model without a firmware map.
-        twice: Two servos seem to have its id.
-        wire: Where it answered. Its methods use the wire at its present rate.
+        twice: True if two servos seem to have its id.
+        wire: The wire on which it answered. The methods use the wire at its present rate.
     """
 
     id: int
@@ -65,7 +65,7 @@ class FoundServo:
         return self.table
 
     def taken_for(self, model: str) -> FoundServo:
-        """Return it with the map of `model`, unless its model number is of another one.
+        """Return this servo with the map of `model`, unless its model number belongs to another model.
 
         Some models have no number of their own, or share one.
         """
@@ -76,7 +76,7 @@ class FoundServo:
         return replace(self, table=table or Table.of(load_firmware_map(model)))
 
     def named(self, name: str) -> Field:
-        """Return a register by its name or its role. Raises ConfigError with the names there are."""
+        """Return a register by its name or its role. Raises ConfigError that lists the valid names."""
         table = self.registers()
         found = table.fields.get(name) or table.role(name)
         if found is None:
@@ -97,7 +97,7 @@ class FoundServo:
         }
 
     def block(self, address: int, length: int, what: str) -> Answer:
-        """Read a block of the control table. Raises ServoError where the servo is silent or refuses."""
+        """Read a block of the control table. Raises ServoError if the servo is silent or refuses."""
         for _ in range(TRIES):
             answer = self.wire.link.read(self.id, address, length)
             if answer is not None:
@@ -107,18 +107,18 @@ class FoundServo:
         raise ServoError(f"id {self.id} does not answer when asked for {what} (status return level 0?)")
 
     def read(self, register: Field) -> int:
-        """Read a register, raw. Raises ServoError where the servo is silent or refuses."""
+        """Read a register, raw. Raises ServoError if the servo is silent or refuses."""
         return register.from_bytes(self.block(register.address, register.size, register.name).data)
 
     def put(self, register: Field, raw: int) -> None:
-        """Write a register and read it back, through the lock of the EEPROM where there is one. Raises ServoError."""
+        """Write a register and read it back; open the lock of the EEPROM if there is one. Raises ServoError."""
         lock = self.registers().role("lock")
         finish(verified_write(self.wire.link, self.id, register, raw, lock=lock, tries=TRIES))
 
     def guard(self, what: str, confirm: Confirm, mute: bool = False) -> None:
-        """Check, before EEPROM is written, that torque is off (which a `mute` servo cannot say), and ask.
+        """Check, before EEPROM is written, that torque is off, and ask. A `mute` servo cannot report torque.
 
-        Raises ServoError where torque is on, ConfigError where the answer is no.
+        Raises ServoError if torque is on, ConfigError if the user declines.
         """
         torque = None if mute else self.registers().role("torque_enable")
         if torque is not None and self.read(torque):
@@ -130,19 +130,19 @@ class FoundServo:
 
 
 def ask(question: str, confirm: Confirm) -> None:
-    """Raise ConfigError unless `confirm` says yes."""
+    """Raise ConfigError unless `confirm` returns True."""
     if not confirm(question):
         raise ConfigError(f"nothing was written: {question} (not confirmed)")
 
 
 class Wire:
-    """A port and the servos behind it. The port belongs to the caller.
+    """A port and the servos behind it. The caller opens and closes the port.
 
     Args:
         family: A name of `servo_families`.
-        baud: The port's rate now; with `fixed` no other rate is looked at.
-        model: The model of every servo, whatever its number; None goes by the number.
-        place: Options that lead a command here; by default those of the port.
+        baud: The port's present rate; with `fixed` no other rate is tried.
+        model: The model of every servo, regardless of its model number; None: the number decides.
+        place: Options that make a command use this wire; by default those of the port.
     """
 
     def __init__(
@@ -170,7 +170,7 @@ class Wire:
         return f"sfms-robot servo {words} {self._place}"
 
     def at(self, baud: int) -> RegisterLink:
-        """Change to another rate; return the link. Raises PortError when the adapter cannot do it."""
+        """Change to another rate; return the link. Raises PortError when the adapter does not support it."""
         if baud != self.baud:
             self.port.set_baud(baud)
             self.port.discard_input()
@@ -187,9 +187,9 @@ class Wire:
         return None
 
     def answering(self, ids: Iterable[int] | None = None) -> Iterator[FoundServo]:
-        """Yield the servos of `ids` that answer at the present rate, asked once each.
+        """Yield the servos of `ids` that answer at the present rate; each is pinged once.
 
-        None asks all servos: with one broadcast where the family has it, else id by id.
+        None pings all servos: with one broadcast if the family has it, else id by id.
         """
         if ids is None and self.kind.broadcast:
             yield from (self._identified(servo, each) for servo, each in sorted(self.link.broadcast_ping().items()))
@@ -199,7 +199,7 @@ class Wire:
                 yield seen
 
     def find(self, servo: int) -> FoundServo:
-        """Return a servo, at whatever rate it answers; the wire stays at that rate. Raises BusError."""
+        """Return a servo, at any rate at which it answers; the wire stays at that rate. Raises BusError."""
         self.check_id(servo)
         for _ in self.reachable():
             seen = self.ping(servo, TRIES if len(self.bauds) == 1 else 2)
@@ -211,7 +211,7 @@ class Wire:
         )
 
     def reachable(self) -> Iterator[int]:
-        """Yield every rate to look at, the wire set to it. Rates that the adapter cannot do are skipped."""
+        """Yield every rate to try, with the wire set to it. Rates that the adapter does not support are skipped."""
         for baud in self.bauds:
             try:
                 self.at(baud)
@@ -241,15 +241,15 @@ class Wire:
 
 @contextmanager
 def open_wire(port: str | None, family: str, baud: int | None, head: str, model: str | None = None) -> Iterator[Wire]:
-    """Open a wire on a device, or on the emulated servos of `head` for `sim`; None is the only serial port there is.
+    """Open a wire on a device, or on the emulated servos of `head` for `sim`; None: the only serial port.
 
-    `baud` None: look at every rate. Raises PortError, ConfigError.
+    `baud` None: try every rate. Raises PortError, ConfigError.
     """
     kind, clock, place = _family(family), RealClock(), None
     check_baud(family, baud)
     with ExitStack() as stack:
         if port == SIM:
-            # Its numerics take longer to load than most tools to run.
+            # Importing the numerics of a head takes longer than most tools run.
             from sfms_robot.app.wiring import EmulatedPort, plugged_in
 
             described = load_head(head)
@@ -269,7 +269,7 @@ def open_wire(port: str | None, family: str, baud: int | None, head: str, model:
 
 
 def check_baud(family: str, baud: int | None) -> None:
-    """Raise ConfigError for a rate beyond those of the family: at 5 baud a question takes minutes."""
+    """Raise ConfigError for a rate outside the range of the family: at 5 baud a request takes minutes."""
     kind = _family(family)
     if baud is not None and kind.bauds and not min(kind.bauds) <= baud <= max(kind.bauds):
         raise ConfigError(
@@ -278,7 +278,7 @@ def check_baud(family: str, baud: int | None) -> None:
 
 
 def only_port() -> str:
-    """Return the serial port of a computer that has one. Raises ConfigError naming those it has."""
+    """Return the only serial port of this computer. Raises ConfigError, with the list, if there is not one."""
     names = [each.by_id or each.path for each in list_ports()]
     if len(names) == 1:
         return names[0]
@@ -287,7 +287,7 @@ def only_port() -> str:
 
 
 def table_of(family: str, number: int | None, firmware: int | None, model: str | None = None) -> Table | None:
-    """Return the control table of a model number, or None; `model` is preferred where several share the number."""
+    """Return the control table of a model number, or None; `model` is preferred if several share the number."""
     models = _models(family, tuple(map_files())).get(number, ()) if number is not None else ()
     if not models:
         return None
@@ -295,12 +295,12 @@ def table_of(family: str, number: int | None, firmware: int | None, model: str |
     try:
         return Table.of(load_firmware_map(name) if firmware is None else variant(name, firmware))
     except ConfigError:
-        return Table.of(load_firmware_map(name))  # a firmware newer than the maps: the layout known is the best guess
+        return Table.of(load_firmware_map(name))  # a firmware newer than the maps: the known layout is the best guess
 
 
 @cache
 def _models(family: str, files: tuple[Path, ...]) -> Mapping[int, Sequence[str]]:
-    """Return the models of each number. Reads only the heads of the files: loading all of them takes a second."""
+    """Return the models of each number. Searches the files for a few keys only: loading all maps takes a second."""
     wanted, protocol = _family(family).maps
     found: dict[int, list[tuple[bool, str]]] = {}
     for file in files:
@@ -322,20 +322,20 @@ def _family(name: str) -> BusFamily:
 
 _FIRST_IDS: Final = 20
 _ID_S: Final = 0.02  # an adapter may hold an answer back for 16 ms
-_RATES: Final = 3  # of each family, those met most often
+_RATES: Final = 3  # number of rates tried for each family, those that are used most often
 
 
 def other_wires(wire: Wire) -> Iterator[Wire]:
-    """Yield the same port for each other family whose servos answer, at the rate at which they do.
+    """Yield a wire on the same port for each other family whose servos answer, at the rate at which they answer.
 
     Each family is tried at its usual rates: by a broadcast ping, or for protocol 1, whose frames the families share, by
-    the first twenty ids. Takes at most 3 s on a silent wire, and leaves it at its rate.
+    the first twenty ids. Takes at most 3 s on a silent wire, and restores its rate.
     """
     before = wire.baud
     try:
         for name, family in servo_families().items():
             for baud in family.bauds[:_RATES] if name != wire.family else ():
-                with suppress(PortError):  # of an adapter that cannot do this rate
+                with suppress(PortError):  # the adapter does not support this rate
                     wire.at(baud)
                     other = Wire(wire.port, name, baud, fixed=True)
                     other.link.silence_s = _ID_S

@@ -1,6 +1,6 @@
-"""The tools of `sfms-robot servo` for single servos: find, look, write, set id and rate, start over.
+"""The tools of `sfms-robot servo` for single servos: find, read, write, set id and rate, reset.
 
-EEPROM is written in steps that can be trusted: a question first (`confirm`), torque off, the lock register opened where
+EEPROM is written in safe steps: the user confirms first (`confirm`), torque is off, the lock register is opened if
 there is one, and afterwards the value is read back.
 """
 
@@ -24,7 +24,7 @@ from sfms_robot.errors import ConfigError, ServoError
 from sfms_robot.servo.codecs.dxl2 import ALERT
 from sfms_robot.servo.registers import Field, span_of
 
-BACK_S: Final = 2.0  # a servo that restarts is back by then
+BACK_S: Final = 2.0  # longest restart of a servo
 _STEP_S: Final = 0.1
 _RESETS: Final = {"all": 0xFF, "keep-id": 1, "keep-id-and-baud": 2}
 _LONGEST: Final = 128  # bytes of one read
@@ -46,7 +46,7 @@ _WATCHED: Final = (
 def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_progress) -> list[FoundServo]:
     """Return all servos that answer at any of the wire's rates, by rate and id.
 
-    `ids` are asked one by one; None asks all at once where the family can, else every id there is.
+    `ids` are pinged one by one. None pings all at once if the family supports it, else every possible id.
     """
     for servo in ids or ():
         wire.check_id(servo)
@@ -65,12 +65,12 @@ def scan(wire: Wire, ids: Sequence[int] | None = None, progress: Progress = no_p
 def scan_all(wire: Wire, ids: Sequence[int] | None, progress: Progress = no_progress) -> tuple[list[FoundServo], str]:
     """Return the servos of `scan` and those of other families on the same wire, and the `--family` of these.
 
-    Families of protocol 1 share their frames: a servo is listed under the one that knows its model.
+    Families of protocol 1 share their frames: a servo is listed under the family that has a map of its model.
     """
     others = list(other_wires(wire))
     found: list[FoundServo] = []
     for each in (wire, *others):
-        wire.at(each.baud)  # one port for all
+        wire.at(each.baud)  # all wires share one port
         found += scan(each, ids, progress)
     known = {(seen.id, seen.baud) for seen in found if seen.table is not None}
     listed = [seen for seen in found if seen.table is not None or (seen.id, seen.baud) not in known]
@@ -118,7 +118,7 @@ class ServoState:
         return None if field is None else self.values.get(field.name)
 
     def in_unit(self, name: str) -> float | None:
-        """Return the same in the unit of the firmware map."""
+        """Return the value of a role or register in the unit of the firmware map; None when it was not read."""
         field, raw = self._field(name), self.value(name)
         return None if field is None or raw is None else field.to_unit(raw)
 
@@ -136,7 +136,7 @@ class ServoState:
         return None if value is None else bool(value)
 
     def measured(self, digits: int, **roles: str) -> dict[str, float | None]:
-        """Return values in their units, each under the name of its argument; None for one that was not read."""
+        """Return values in their units, each under the name of its argument; None for values that were not read."""
         return {key: None if (x := self.in_unit(role)) is None else round(x, digits) for key, role in roles.items()}
 
     def health(self) -> Row:
@@ -225,10 +225,10 @@ def read_registers(seen: FoundServo, names: Sequence[str]) -> list[Row]:
 def write_register(seen: FoundServo, name: str, text: str, confirm: Confirm) -> Row:
     """Write one register; return the row of `servo write`.
 
-    `text`: a raw number, or one with the register's unit: 90deg. The status return level is written without reading it
-    first: a servo at level 0 answers no read.
+    `text`: a raw number, or a number with the register's unit, such as 90deg. The status return level is written
+    without reading it first: a servo at level 0 answers no read.
 
-    Raises ConfigError for a value that the register does not take, ServoError when the servo refuses.
+    Raises ConfigError for a value that the register does not accept, ServoError when the servo refuses.
     """
     table, field = seen.registers(), seen.named(name)
     if field in (table.role("id"), table.role("baud_rate")):
@@ -247,7 +247,7 @@ def write_register(seen: FoundServo, name: str, text: str, confirm: Confirm) -> 
 
 
 def parse_value(model: str, field: Field, text: str) -> int:
-    """Return the raw value of a number, or of one with the register's unit. Raises ConfigError outside its range."""
+    """Return the raw value of a raw number, or of a number with a unit. Raises ConfigError outside its range."""
     number, unit = parse_number(text)
     if not number or (unit and unit != field.unit):
         forms = ["a raw number", *([f"a number with unit {field.unit}"] if field.unit else [])]
@@ -259,19 +259,19 @@ def parse_value(model: str, field: Field, text: str) -> int:
 
 
 def parse_number(text: str) -> tuple[str, str]:
-    """Split `12.5deg` into number and unit; two empty texts for what is neither that nor a whole number alone."""
+    """Split `12.5deg` into number and unit. Only a whole number may have no unit; two empty texts for all else."""
     match = re.fullmatch(r"\s*([-+]?\d{1,20}(?:\.\d+)?)\s*([A-Za-z_]\w*)?\s*", text)
     return ("", "") if match is None or (not match[2] and "." in match[1]) else (match[1], match[2] or "")
 
 
-# --- id, rate, start over ---------------------------------------------------------------------------------------
+# --- id, rate, reboot, reset ------------------------------------------------------------------------------------
 
 
 def set_id(seen: FoundServo, new: int, confirm: Confirm, in_chain: bool = False) -> FoundServo:
-    """Give a servo another id. With other servos on the wire only when `in_chain` says that this is meant:
-    two new servos with one id can look like one, and both would be changed.
+    """Change the id of a servo. If other servos are on the wire, `in_chain` must be set.
 
-    Raises ConfigError for an id that cannot be used, ServoError when the servo does not take it.
+    Two new servos with one id can look like one, and both would be changed. Raises ConfigError for an id that cannot be
+    used, ServoError when the servo does not accept it.
     """
     wire = seen.wire
     wire.check_id(new, "new id")
@@ -295,12 +295,12 @@ def set_id(seen: FoundServo, new: int, confirm: Confirm, in_chain: bool = False)
 
 
 def set_baud(seen: FoundServo, baud: int, confirm: Confirm) -> FoundServo:
-    """Give a servo another rate, and find it there. Raises ConfigError, PortError, ServoError."""
+    """Change the rate of a servo, and find it at the new rate. Raises ConfigError, PortError, ServoError."""
     wire, codes = seen.wire, {rate: code for code, rate in seen.registers().baud_codes.items()}
     if baud not in codes:
         raise ConfigError.at(seen.model, "baud", baud, "is not a rate of this servo", sorted(codes))
     before = wire.baud
-    wire.at(baud)  # an adapter that cannot do it fails while the servo can still be reached
+    wire.at(baud)  # an adapter that does not support it fails now, while the servo can still be reached
     wire.at(before)
     seen.guard(f"baud {before} -> {baud}", confirm)
     _move_to(seen, "baud_rate", codes[baud], baud=baud)
@@ -314,7 +314,7 @@ def set_baud(seen: FoundServo, baud: int, confirm: Confirm) -> FoundServo:
 
 
 def reboot(seen: FoundServo, confirm: Confirm) -> FoundServo:
-    """Start a servo over: torque goes off, hardware errors are cleared. Return it once it answers again."""
+    """Reboot a servo: torque goes off, hardware errors are cleared. Return it once it answers again."""
     torque = seen.table.role("torque_enable") if seen.table else None
     if torque is not None and seen.read(torque):
         ask(f"id {seen.id} has torque on; a reboot lets go of what it holds", confirm)
@@ -328,14 +328,14 @@ def reboot(seen: FoundServo, confirm: Confirm) -> FoundServo:
 def factory_reset(seen: FoundServo, keep: str, confirm: Confirm) -> FoundServo:
     """Set a servo to its factory values. `keep`: all (keeps nothing), keep-id, keep-id-and-baud.
 
-    Protocol 1 resets everything; what is to be kept is written back.
+    Protocol 1 resets everything; the values to be kept are written back.
     """
     if keep not in _RESETS:
         raise ConfigError.at("servo", "factory reset", keep, "is unknown", _RESETS)
     wire, table, home = seen.wire, seen.registers(), seen.wire.baud
     identity, rate, whole = table.role("id"), table.default_baud, keep == "all" or table.protocol == 1
     new_id = seen.id if not whole or identity is None else identity.initial
-    taken = new_id != seen.id and wire.ping(new_id) is not None  # at this rate, which need not be the factory's
+    taken = new_id != seen.id and wire.ping(new_id) is not None  # at its rate, which may not be the factory's
     if new_id != seen.id:
         if rate is not None and wire.at(rate).ping(new_id) is not None:
             raise ConfigError(f"id {new_id}, which a new servo has, is taken by another one at {rate} baud: unplug it")
@@ -360,7 +360,7 @@ def _accepted(seen: FoundServo, answer: Any, what: str) -> None:
 
 
 def _move_to(seen: FoundServo, role: str, raw: int, new_id: int | None = None, baud: int | None = None) -> None:
-    """Write a register after which the servo has another id or rate: the lock has to be closed there."""
+    """Write a register that changes the servo's id or rate; then close the lock, at the new id or rate."""
     wire, field, lock = seen.wire, seen.registers().role(role), seen.registers().role("lock")
     if field is None:
         raise ServoError(f"id {seen.id}: {seen.model} has no register for its {role}")
@@ -385,7 +385,7 @@ def _wait_for(wire: Wire, servo: int) -> FoundServo | None:
 
 
 class DumpedServo(Model):
-    """One servo as it was: raw values by register name."""
+    """The stored state of one servo: raw values by register name."""
 
     id: int
     model: str
@@ -419,14 +419,14 @@ def dump(servos: Sequence[FoundServo]) -> Dump:
 
 
 def check_new(file: Path) -> None:
-    """Raise ConfigError where a dump cannot be written or a file exists: it may be the only copy of such settings."""
+    """Raise ConfigError if a dump cannot be written or the file exists, which may be the only copy of settings."""
     if file.exists():
         raise ConfigError(f"{file}: is there already, name another file")
     checked_file(file, "servo dump")
 
 
 def save_dump(what: Dump, file: Path) -> None:
-    """Write a dump. Raises ConfigError as `check_new`."""
+    """Write a dump. Raises ConfigError as `check_new` does."""
     check_new(file)
     text = "# Registers of servos, raw; `sfms-robot servo restore` writes the lasting ones back.\n"
     with file.open("x", encoding="utf-8") as out:
@@ -450,9 +450,9 @@ def differences(seen: FoundServo, was: DumpedServo) -> list[tuple[str, int, int]
 def restore(seen: FoundServo, was: DumpedServo, confirm: Confirm, identity: bool = False) -> list[Row]:
     """Write the EEPROM of a dumped servo into `seen`, each register verified; return a row for each change.
 
-    The changes are shown in one question. With `identity` the servo gets id and rate of the file as well, last.
+    One question shows all changes. With `identity` the servo also gets the id and rate of the file, last.
 
-    Raises ConfigError for another model or an answer of no, ServoError for a servo that has torque on or refuses.
+    Raises ConfigError for another model or if the user declines, ServoError for a servo that has torque on or refuses.
     """
     wire, table, changes = seen.wire, seen.registers(), differences(seen, was)
     if changes:

@@ -1,8 +1,8 @@
-"""`sfms-robot bench`: each part beside a peer or a baseline, both measured in the same run.
+"""`sfms-robot bench`: each part compared with a peer or a baseline that is measured in the same run.
 
-`BENCHES` lists all of them; a new bench is one entry here and the function that the entry names. The function takes the
-options of its entry as keywords and returns rows by name (`measure.row`), or a `measure.BenchResult` with a table of
-its own. Modules are imported when they are measured: shell completion imports this file.
+`BENCHES` lists all benches. A new bench is one entry here and the function that the entry names. The function accepts
+the options of its entry as keywords and returns rows by name (`measure.row`), or a `measure.BenchResult` with its own
+table. A bench module is imported only when it is measured, because shell completion imports this file.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ ALL: Final = "all"
 
 @dataclass(frozen=True)
 class Bench:
-    """One thing to measure.
+    """A bench of the command.
 
     Attributes:
         place: "module:function" in this folder.
         about: The quantity and its peer.
-        in_all: Part of `bench all`: takes a minute or two and needs no extra package.
-        takes: Options that it understands; "say" is a function that prints progress.
+        in_all: True if the bench is part of `bench all`: it lasts a minute or two and needs no extra package.
+        takes: Options that the bench accepts; "say" is a function that prints progress.
     """
 
     place: str
@@ -94,15 +94,15 @@ BENCHES: Final[Mapping[str, Bench]] = {
 
 
 def run_bench(name: str, given: Mapping[str, Any], say: Say) -> BenchResult:
-    """Measure `name`, or everything that belongs to "all"; `say` gets one line of progress for each.
+    """Measure the bench `name`, or every bench that belongs to "all"; `say` prints progress.
 
     Args:
         name: A key of `BENCHES`, or "all".
-        given: The options that were given, by name. `against`, the folder of another installation, works with every
-            bench of rows: that installation becomes the peer, and the two run in turn.
+        given: The given options by name. `against`, the folder of another installation, works with every bench that
+            returns rows: that installation becomes the peer, and the two run in turn.
         say: Prints a line.
 
-    Raises ConfigError for an unknown name or an option that the bench does not take, and whatever the bench raises.
+    Raises ConfigError for an unknown name or an option that the bench does not accept, and the errors of the bench.
     """
     from sfms_robot.lab.bench.measure import BenchResult, compare_installations
 
@@ -122,8 +122,8 @@ def run_bench(name: str, given: Mapping[str, Any], say: Say) -> BenchResult:
 def measure_all(chosen: Mapping[str, Bench], say: Say) -> BenchResult:
     """Return the rows of all benches `chosen`, measured one after the other.
 
-    A bench that cannot run here is skipped with a message. A bench that fails adds a line, and the result has not
-    passed; the others are still measured.
+    A bench that cannot run here is skipped with a message. A bench that fails adds a line, and `passed` of the result
+    is False; the others are still measured.
     """
     from sfms_robot.lab.bench.measure import BenchResult
 

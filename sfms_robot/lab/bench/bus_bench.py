@@ -1,10 +1,11 @@
-"""`bench bus`: the bus beside the vendor SDK's calls, on the same emulated servos, in real time.
+"""`bench bus`: the bus compared with the vendor SDK's calls, on the same emulated servos, in real time.
 
-    write, tick     host CPU of a sync write; of a write and a read of all servos
-    cpu_share       of a core, at 100 ticks a second
-    one_silent      ticks a second at 100 Hz with one dead servo; those behind it do not answer a shared read
+    write, tick     host CPU time of a sync write, and of a write and a read of all servos
+    cpu_share       share of a core at 100 ticks a second
+    one_silent      ticks a second at 100 Hz with one dead servo; servos behind it do not answer a shared read
 
-A servo counts as silent after `DEADLINE_MS`, longer than on a wire: the emulator shares the computer's cores.
+A servo counts as silent after `DEADLINE_MS`. This is longer than on a wire, because the emulator shares the computer's
+cores.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ RATE_HZ: Final = 100.0
 DEADLINE_MS: Final = 8.0
 _CALLS: Final = 500
 _PACED_TICKS: Final = 200
-_WINDOW: Final = 25  # ticks over which a rate is taken
-_GOAL: Final = (116, 4)  # address and length of registers of X servos
+_WINDOW: Final = 25  # ticks over which a rate is measured
+_GOAL: Final = (116, 4)  # (address, length) of the registers of X servos
 _POSITION: Final = (132, 4)
 _MIDDLE: Final = b"\x00\x08\x00\x00"
 
@@ -43,7 +44,7 @@ class Host:
 
 
 def bus() -> Rows:
-    """Return all rows; ours first, then the vendor SDK on the same servos."""
+    """Return all rows; our bus is measured first, then the vendor SDK on the same servos."""
     head = load_head(HEAD)
     patient = head.buses["main"].model_copy(update={"read_deadline_ms": DEADLINE_MS})
     head = head.model_copy(update={"buses": {"main": patient}})
@@ -82,7 +83,7 @@ def _one_silent(head: Head) -> Row:
 
 
 def _paced(host: Host) -> tuple[list[float], list[float]]:
-    """Return (ticks a second, processor seconds a second) at 100 Hz, by window; late ticks are not made up for."""
+    """Return (ticks a second, processor seconds a second) of each window at 100 Hz; late ticks are not made up for."""
     pace = RealClock()
     rates, shares = [], []
     ticks = tick_times(pace, RATE_HZ, pace.now_s())
@@ -107,7 +108,7 @@ def _ours(head: Head, device: str) -> Iterator[Host]:
     bus = build_bus(head, {"main": device}, clock)
     bus.connect()
     held = bus.enable(list(head.joints))
-    joints = head.joints.values()  # without power the joints sag out of their ranges: they move in first
+    joints = head.joints.values()  # without power the joints sag out of their ranges, so the goals are moved inside
     held = np.clip(held, [joint.min_rad for joint in joints], [joint.max_rad for joint in joints])
 
     def write() -> None:

@@ -1,21 +1,22 @@
 """`bench campaign`: every fault on every family of servos, in virtual time.
 
-One run: four emulated servos follow a slow wave under the limiter, as in the loop. Either a fault of the emulator
-begins after a while, and when it is over the servos get time to recover; or the servos differ from the head's file from
-the start, or half of them are lost for good. Runs are judged from outside, by the goals and positions of the servos:
+In one run four emulated servos follow a slow wave through the limiter, as in the loop. Either a fault of the emulator
+begins after a while, and after its end the servos get time to recover; or the servos differ from the head's file from
+the start; or half of them are lost for good. A run is judged by the servos' own goals and positions, without the bus:
 
     escaped       an exception that the bus should have caught, or a bad goal that was accepted
-    outside       goals outside the limits of a joint that a servo held
+    outside       goals outside the limits of a joint, counted for servos with torque
     pulse_us      the shortest and longest pulse of a board
-    stale         readings whose position differs from the servo's at the time they state
-    recovered_s   from the end of the fault until every joint is read, has torque and follows its goal, for good
-    named         joints that stay out, with their fault: latched protection, or a servo that the bus gave up
-    refused       the error at the start, of servos that contradict the head's file
-    off_s, stop_s until the torque was off, and until `stop` returned, when no servo answers
+    stale         readings whose position differs from the servo's position at the time of the reading
+    recovered_s   time from the end of the fault until every joint is read, has torque and follows its goal, for good
+    named         joints that stay disabled, with their fault: latched protection, or a servo that the bus gave up
+    refused       the error at the start, if servos contradict the head's file
+    off_s, stop_s time until torque was off, and until `stop` returned, when no servo answers
     left_on       servos with torque after the run
 
 The effect of a corrupted byte from the host is stated per family (`corrupted_bytes`). On a board without a checksum
-goals outside the limits are part of it, not a failure. Virtual time and seeded dice make every run repeatable.
+goals outside the limits are an expected effect, not a failure. Virtual time and seeded random numbers make every run
+repeatable.
 """
 
 from __future__ import annotations
@@ -48,14 +49,14 @@ from sfms_robot.lab.bench.measure import BenchResult, Say
 from sfms_robot.servo.port import WrappedPort
 
 _TICKS: Final = 1000
-_QUIET, _FAULTY = 0.1, 0.5  # fraction of the ticks before the fault, and with it
+_QUIET, _FAULTY = 0.1, 0.5  # fraction of the ticks before the fault, and during it
 _BAD_GOALS_EVERY: Final = 50
-_OFF_S, _STOP_S = 0.02, 0.5  # the longest that torque-off and `stop` may take
-_FAILS_AFTER_S: Final = 1.0  # a bus on which no servo answers; a board gets five times that
-_REPORTED_BY_S: Final = 7.0  # a board that fails is reported
+_OFF_S, _STOP_S = 0.02, 0.5  # longest allowed time until torque is off, and until `stop` returns
+_FAILS_AFTER_S: Final = 1.0  # time without any answer after which a bus fails; for a board five times as long
+_REPORTED_BY_S: Final = 7.0  # longest time until the failure of a board is reported
 _OUTSIDE_DEG: Final = 8.0
 
-# Of each kind, with which it begins: ids (all of the wire if there are none), time and value.
+# A fault of each kind: the kind, then ids (all servos of the wire if there are none), time and value.
 SPECS: Final = {
     spec.partition("{")[0]: spec
     for spec in (
@@ -87,12 +88,12 @@ STARTS: Final = (STORED, MANY_TURNS, OUTSIDE)
 CASES: Final = (*KINDS, *STARTS, HALF_DEAD, MUTE_AT_STOP)
 CONTRADICTS: Final = frozenset({STORED, MANY_TURNS})  # the bus may refuse such a servo at the start
 LATCHED: Final = frozenset({"overload", "overheat", "voltage", "stuck"})  # a servo's protection latches these
-LIMP_S: Final = {"stuck": 3.0}  # a joint that was pinched stays limp that long before it recovers
+LIMP_S: Final = {"stuck": 3.0}  # time for which a pinched joint stays limp before it recovers
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaseOutcome:
-    """The outcome of one case on one family; see the head of this file. `possible`: the family can have that case."""
+    """The outcome of one case on one family (see the top of this file). `possible`: the family can have this case."""
 
     family: str
     case: str
@@ -111,7 +112,7 @@ class CaseOutcome:
 
     @property
     def as_stated(self) -> bool:
-        """Return whether every joint recovered in time, or stays out for a stated reason."""
+        """Return whether every joint recovered in time, or stays disabled for a stated reason."""
         if self.case == MUTE_AT_STOP:
             return (self.off_s or 0.0) <= _OFF_S and (self.stop_s or 0.0) <= _STOP_S and self.off_s is not None
         if self.refused is not None:
@@ -129,14 +130,14 @@ class CaseOutcome:
 
 @dataclass
 class SilencePort(WrappedPort):
-    """A port on which silence costs time; written bytes arrive at once, and `arrived` is called."""
+    """A port whose silent reads last until their deadline; written bytes arrive at once, then `arrived` is called."""
 
     baud: int
     arrived: Callable[[], None]
 
     def write(self, data: bytes) -> None:
         self.inner.write(data)
-        self.inner.set_baud(self.baud)  # hands over what was written
+        self.inner.set_baud(self.baud)  # delivers the written bytes at once
         self.arrived()
 
     def read(self, n: int, deadline_s: float) -> bytes:
@@ -197,7 +198,7 @@ def table(outcomes: Sequence[CaseOutcome]) -> list[Figures]:
 
 
 def one(family: str, case: str, ticks: int = _TICKS) -> CaseOutcome:
-    """Run `ticks` of one family in one case."""
+    """Run one family in one case for `ticks` ticks."""
     if case == MUTE_AT_STOP:
         return _mute_at_stop(family)
     head = head_of(family, _FAILS_AFTER_S if case == HALF_DEAD else None)
@@ -222,7 +223,7 @@ def one(family: str, case: str, ticks: int = _TICKS) -> CaseOutcome:
 
 
 def _found(servos: Sequence[EmulatedServo], case: str) -> list[EmulatedServo]:
-    """Return the servos, two of them unlike the head's file; none if the family cannot be in that condition."""
+    """Return the servos, two of which differ from the head's file; empty if the family cannot have this case."""
     table = load_firmware_map(servos[0].model)
     turn = round(table.ticks_per_revolution)
     changes: list[Figures]
@@ -249,9 +250,9 @@ def _found(servos: Sequence[EmulatedServo], case: str) -> list[EmulatedServo]:
 
 
 def _ride(rig: Rig, outcome: CaseOutcome, over_s: float) -> CaseOutcome:
-    """Run the ticks and judge them; the fault is over at `over_s`, or half of the buses die then.
+    """Run the ticks and judge them; at `over_s` the fault ends, or one of the two buses fails.
 
-    A bus that dies is reported once, by a BusError, and the other one continues.
+    A failed bus is reported once, by a BusError, and the other bus continues.
     """
     judge, reports, dies = Judge(rig), 0, outcome.case == HALF_DEAD
     for tick in range(outcome.ticks):
@@ -269,7 +270,7 @@ def _ride(rig: Rig, outcome: CaseOutcome, over_s: float) -> CaseOutcome:
     if dies and not reports and rig.clock.now_s() > over_s + _REPORTED_BY_S:
         outcome = replace(outcome, escaped="nothing: the failure of a bus was not reported")
     for chain in rig.chains.values():
-        chain.clear_faults()  # dead servos are connected again: torque off has to reach them
+        chain.clear_faults()  # connects dead servos again, so that torque off can reach them
     outcome = replace(
         outcome,
         outside=judge.outside,
@@ -282,14 +283,14 @@ def _ride(rig: Rig, outcome: CaseOutcome, over_s: float) -> CaseOutcome:
 
 
 def _at_the_end(rig: Rig, outcome: CaseOutcome) -> CaseOutcome:
-    """Switch torque off, and count the servos that still have it."""
+    """Switch torque off, and count the servos that still have torque."""
     rig.bus.stop("release")
     rig.bus.close()
     return replace(outcome, left_on=sum(bool(state["torque"]) for state in rig.states()))
 
 
 def _mute_at_stop(family: str) -> CaseOutcome:
-    """Call `stop` while all servos obey and none answers, and silence costs time."""
+    """Call `stop` while all servos obey but do not answer, on a port where waiting for an answer costs time."""
     head, start_s, off_s = head_of(family), np.inf, np.inf
 
     def arrived() -> None:

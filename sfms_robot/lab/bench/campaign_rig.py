@@ -24,16 +24,16 @@ from sfms_robot.servo.port import Port
 
 RATE_HZ: Final = 100.0
 LIMIT_DEG: Final = 40.0
-RECOVERY_S: Final = 2.0  # after the fault is over
+RECOVERY_S: Final = 2.0  # longest allowed time to recover after the end of the fault
 _DEADLINE_S: Final = 0.003
 _WAVE_RAD, _WAVE_S = 0.4, 4.0
-_STALE_TICKS: Final = 3  # rounding, and what the servo moves while it answers
+_STALE_TICKS: Final = 3  # allowed difference: rounding, and the movement of the servo while it answers
 _FRESH_S: Final = 0.3
 _FOLLOWS_RAD: Final = 0.15
 
 
 class ServoFamily(NamedTuple):
-    """A bus with servos of one model. `checksum`: of its packets; "" for a protocol without."""
+    """A bus with servos of one model. `checksum`: The checksum of its packets; "" if the protocol has none."""
 
     bus: str
     model: str
@@ -55,8 +55,9 @@ FAMILIES: Final = {
 
 
 def head_of(family: str, reconnect_s: float | None = None) -> Head:
-    """Return four joints of a family on the bus `main`; with `reconnect_s` on two, `main` and `other`, which fail then.
+    """Return a head with four joints of a family on the bus `main`.
 
+    With `reconnect_s` the joints are on two buses, `main` and `other`, which fail after this time without any answer.
     Raises ConfigError for an unknown family.
     """
     if family not in FAMILIES:
@@ -90,7 +91,7 @@ class Rig:
         self.conversion = calibration_of(head.joints)
         self._limiter = JerkLimiter(JointLimits.of(head), 1.0 / RATE_HZ)
         [model] = {joint.model for joint in head.joints.values()}
-        self.tick_us = load_firmware_map(model).tick_us or 0.0  # of a board, which reports no position; else 0
+        self.tick_us = load_firmware_map(model).tick_us or 0.0  # of a board, which reports no positions; else 0
 
     def hold(self) -> None:
         self.bus.connect()
@@ -107,7 +108,7 @@ class Rig:
         turn = 2 * math.pi / _WAVE_S
         phase = turn * (now_s - self._began_s)
         way = np.where(np.arange(len(self.ids)) % 2, -1.0, 1.0) * _WAVE_RAD
-        angle = self._centre + way * math.sin(phase)  # a wave that begins at rest at the held angles
+        angle = self._centre + way * math.sin(phase)  # a wave around the held angles, clipped to +-0.1 rad
         wave = np.array([angle, way * turn * math.cos(phase), -way * turn * turn * math.sin(phase)])
         self.goals, self._state = self._limiter.step(wave, self._state)
         self.bus.write(self.goals, now_s)
@@ -122,9 +123,9 @@ class Rig:
         return readings
 
     def try_bad_goals(self, withheld: bool) -> None:
-        """Send bad goals of the last joint. Raises AssertionError for one that the bus accepts.
+        """Send bad goals for the last joint. Raises AssertionError if the bus accepts one.
 
-        Goals out of range are left out while a fault or the return of a joint may hold its goals back.
+        Goals out of range are left out while a fault or the return of a joint may hold the joint's goals back.
         """
         bad_rad = [math.nan, math.inf]
         if not withheld and self.states()[-1]["goal"] == self.conversion.to_ticks(self.goals)[-1]:
@@ -136,14 +137,14 @@ class Rig:
                 raise AssertionError(f"a goal of {bad:g} rad is not refused")
 
     def states(self) -> list[Figures]:
-        """Return the state of every servo now, read past the bus."""
+        """Return the current state of every servo, read without the bus."""
         for chain in self.chains.values():
             chain.time_is(self.clock.now_s())
         return [chain.state(servo) for chain, servo in zip(self._wires, self.ids, strict=True)]
 
 
 class Judge:
-    """Judges the servos after every tick, except those of joints `away`, which are lost for good.
+    """A judge of the servos after every tick; joints in `away` are lost for good and need not recover.
 
     A joint that was found outside its range may move anywhere between that place and its range, but not out again.
     """
@@ -175,14 +176,14 @@ class Judge:
         for index, reading in enumerate(readings.values()):
             if reading.position_rad is not None and math.isfinite(reading.age_s):
                 back = round(reading.age_s * RATE_HZ)
-                if back < len(self._shafts):  # else from before the first tick
-                    was_rad = self._shafts[-1 - back][index]  # at the time that the reading states
+                if back < len(self._shafts):  # else the reading is from before the first tick
+                    was_rad = self._shafts[-1 - back][index]  # at the time of the reading
                     self.stale += bool(abs(reading.position_rad - was_rad) > self._slack_rad[index])
         seen = [(i, joint, r) for i, (joint, r) in enumerate(readings.items()) if i not in self.away]
         self.named = [f"{joint}: {r.fault}" for _, joint, r in seen if r.fault is not None]
         follows = np.abs(shafts - rig.goals) < _FOLLOWS_RAD
         fine = [
-            r.fault is not None  # out, with a stated reason
+            r.fault is not None  # disabled, with a stated reason
             or ((rig.tick_us or r.age_s < _FRESH_S) and states[i]["torque"] and follows[i])
             for i, _, r in seen
         ]
@@ -192,7 +193,7 @@ class Judge:
             self.well_since_s = rig.clock.now_s()
 
     def recovered_s(self, end_s: float) -> float | None:
-        """Return the time from `end_s`, the end of the fault, until all was well for good; None if it never was."""
+        """Return the time from `end_s`, the end of the fault, until all joints were well for good; None if never."""
         return None if self.well_since_s is None else max(0.0, self.well_since_s - end_s)
 
 
@@ -202,7 +203,7 @@ def plugged_in(
     servos: Mapping[str, Sequence[EmulatedServo]] | None = None,
     wrap: Callable[[Port], Port] | None = None,
 ) -> Iterator[Rig]:
-    """Emulate a head's servos, or those given by bus; `wrap` puts the port of a single bus into another."""
+    """Emulate a head's servos, or the `servos` given by bus; `wrap` wraps the port of a head with a single bus."""
     clock = VirtualClock()
     with ExitStack() as stack:
         plugged = (emulated(head) if servos is None else servos).items()

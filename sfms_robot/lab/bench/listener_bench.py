@@ -1,13 +1,13 @@
 """`bench listener`: every shipped listener on every engine: speed, start, memory, and loss of accuracy.
 
-Rows "NAME ENGINE" compare the engines: how long a frame takes on each, in the same run, beside eager fp32 torch. A
-frame is everything that a listener does with it: features of sound, events, networks, draws. Every engine has one
-thread, and they take turns, some frames each, so that other load of the machine meets all of them. A plan of several
-frames falls due on every `hop`-th frame; the other frames are only heard.
+Rows "NAME ENGINE" compare the duration of a frame on each engine with eager fp32 torch, in the same run. A frame
+includes all work of the listener: features of sound, events, networks, draws. Every engine has one thread. The engines
+take turns of some frames each, so that other load of the machine affects all of them. A plan of several frames is due
+on every `hop`-th frame; on the other frames the listener only listens.
 
-The row NAME is the engine that `--engine auto` takes, with further figures of the listener: `in_run` beside a servo
-loop. A listener without weights (the sizes of the papers) gets seeded ones: the cost of a frame is
-the same. ARIG's context is filled with random numbers, as full as after an hour.
+The row NAME is the engine that `--engine auto` chooses, with further figures of the listener; `in_run` is measured
+while a servo loop runs. A listener without weights (the sizes of the papers) gets seeded weights, since the cost of a
+frame is the same. ARIG's context is filled with random numbers, as full as after an hour.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ from sfms_robot.ports import Listener
 from sfms_robot.sources.registry import DEFAULT_SPEAKER
 
 NAMES: Final = ("sfms-small", "arig-small", "arig-paper")
-PAPER: Final = "sfms-large"  # ships as a training only
+PAPER: Final = "sfms-large"  # only its training file ships
 TRAINED, SEEDED = "trained", "seeded, not trained"
 EAGER: Final = "eager"
 TURN_HOPS: Final = 4
-_LIMIT_S: Final = 20.0  # for all engines of a listener: a busy machine gives fewer turns
+_LIMIT_S: Final = 20.0  # for all engines of a listener; on a busy machine they have fewer turns
 _COLUMNS: Final = {
     "median": "frame ms", "p99": "p99", "ratio": "of eager", "hearing_ms": "hearing ms", "planning_ms": "planning ms",
     "first_plan_s": "first plan s", "resident_mb": "MB", "distance": "distance",
@@ -85,7 +85,7 @@ def _measured(name: str, scratch: Path) -> Rows:
         rows[f"{name} {way}"]["distance"] = distance(loaded[way], loaded[EAGER], speaker)
         rows[f"{name} {way}"] |= listener_process(*ways[way])
     auto = [*ways][-1]
-    how: Any = getattr(loaded[EAGER], "how", loaded[EAGER])  # of a listener that may also decide events
+    how: Any = getattr(loaded[EAGER], "how", loaded[EAGER])  # the motion part of a listener that also decides events
     rows[name] = rows[f"{name} {auto}"] | {
         "eager_fp32_fps": rows[f"{name} {EAGER}"]["fps"],
         "params": sum(each.numel() for each in how.model.parameters()),
@@ -140,7 +140,7 @@ def _sfms_paper() -> Rows:
 
 
 def aged(listener: Listener, memory: Any, speaker: Sequence[SpeakerFrame], minutes: int = 60) -> Any:
-    """Return a memory as after so many minutes, with random whole chunks; a listener without chunks starts fresh."""
+    """Return a memory as after `minutes`, with random whole chunks; a fresh one for a listener without chunks."""
     _, memory = listener.step(speaker[0], memory)
     how = getattr(memory, "how", memory)
     context = getattr(how, "context", None)
@@ -152,7 +152,7 @@ def aged(listener: Listener, memory: Any, speaker: Sequence[SpeakerFrame], minut
 
 
 def distance(quick: Listener, exact: Listener, speaker: Sequence[SpeakerFrame]) -> float:
-    """Return the RMS difference of motion over its deviation, both listeners stepped from the memory of `exact`."""
+    """Return the RMS difference of motion over its deviation; both listeners step from the memory of `exact`."""
     memory, frames = exact.start(0), []
     for frame in speaker:
         other, _ = quick.step(frame, memory)
@@ -166,7 +166,7 @@ def distance(quick: Listener, exact: Listener, speaker: Sequence[SpeakerFrame]) 
 
 
 def talk(frames: int = 100) -> list[SpeakerFrame]:
-    """Return noise in which both people talk in turns: only time is measured."""
+    """Return noise in which both people talk in turns; its content does not matter, as only time is measured."""
     rng = np.random.default_rng(0)
     out = []
     for index in range(frames):
@@ -178,7 +178,7 @@ def talk(frames: int = 100) -> list[SpeakerFrame]:
 
 
 def in_run(folder: Path, duration_s: float = 8.0) -> Figures:
-    """Drive `HEAD` on emulated servos with the listener in `folder`, which hears both tracks, in real time.
+    """Drive `HEAD` on emulated servos with the listener in `folder`, which receives both tracks, in real time.
 
     The loop must not be late because of the listener, and a step must not take longer than the 40 ms of a frame.
     """
@@ -207,7 +207,7 @@ def in_run(folder: Path, duration_s: float = 8.0) -> Figures:
 
 @dataclass
 class Stream:
-    """A running listener: its memory, and durations of its frames [ms], those with a plan and those without."""
+    """A running listener: its memory, and the durations [ms] of its frames with a plan and without."""
 
     listener: Listener
     memory: Any
@@ -218,7 +218,7 @@ class Stream:
     heard: int = 0
 
     def turn(self, speaker: Sequence[SpeakerFrame], frames: int, keep: bool = True) -> None:
-        """Take so many frames, whole hops; `frame_ms` gains their mean over each hop."""
+        """Step through `frames` frames, which are whole hops; append their mean over each hop to `frame_ms`."""
         took: list[tuple[float, bool]] = []
         for _ in range(frames):
             self.heard += 1
@@ -233,7 +233,7 @@ class Stream:
         self.frame_ms += np.reshape([ms for ms, _ in took], (-1, self.listener.hop)).mean(axis=1).tolist()
 
     def figures(self, peer: Stream) -> Row:
-        """Return a row: a frame beside the peer's, and its parts."""
+        """Return a row: the duration of a frame, that of the peer, and its parts."""
         every_ms = [*self.planning_ms, *self.hearing_ms]
         return row(self.frame_ms, peer.frame_ms, "ms", "eager fp32 torch, one thread") | {
             "engine": engine_name(self.listener),
@@ -246,7 +246,7 @@ class Stream:
 
 
 def take_turns(streams: Mapping[str, Stream], speaker: Sequence[SpeakerFrame], turns: int = 20) -> None:
-    """Let all streams hear the same person, `TURN_HOPS` plans at a time; ends early after `_LIMIT_S`."""
+    """Step all streams in turn with the same person, `TURN_HOPS` plans at a time; end early after `_LIMIT_S`."""
     frames = {name: TURN_HOPS * stream.listener.hop for name, stream in streams.items()}
     for name, stream in streams.items():
         stream.turn(speaker, frames[name], keep=False)
@@ -259,9 +259,9 @@ def take_turns(streams: Mapping[str, Stream], speaker: Sequence[SpeakerFrame], t
 
 
 def engines_of(folder: Path, scratch: Path) -> dict[str, tuple[Path, EngineName]]:
-    """Return the ways to run the listener of a folder, by name: a folder and an engine each.
+    """Return the ways to run the listener of a folder, by name: a folder and an engine for each way.
 
-    The first one is the peer, the last one is the choice of `--engine auto`. Folders with other precisions are made in
+    The first way is the peer, the last one is the choice of `--engine auto`. Folders with other precisions are made in
     `scratch`.
     """
     settings = checkpoint.load_config(folder)
@@ -275,7 +275,7 @@ def engines_of(folder: Path, scratch: Path) -> dict[str, tuple[Path, EngineName]
 
 
 def _of_precision(folder: Path, settings: config.ListenerSettings, precision: str, scratch: Path) -> Path:
-    """Return a folder of the listener with another precision; its own folder if it has that one, or has none."""
+    """Return a folder of the listener with `precision`: its own folder if it has that precision, or has none."""
     if not isinstance(settings, config.Arig) or settings.precision == precision:
         return folder
     other = scratch / precision

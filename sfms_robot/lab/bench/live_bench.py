@@ -1,14 +1,14 @@
 """`bench live`: a head that listens live, with a microphone and a phone, in real time.
 
-    idle          an empty loop of 100 Hz: how punctual this machine is without load from here
+    idle          an empty loop of 100 Hz: the punctuality of this machine without load from this program
     live          the measured run of `face28` and `sfms-small`, on servos with the timing of a wire, with a recording
     file          the same head and listener with a recorded person, for comparison
-    first_write   from typing `run` with live sources to its first goal on the wire; median of some starts
+    first_write   time from typing `run` with live sources to its first goal on the wire; median of some starts
 
-The microphone is a null sink of a private PulseAudio into which a recorded voice is played, so that PortAudio's
-callbacks, the audio process and the grid are those of a real microphone; "push" hands the same voice over by calls. The
-phone sends recorded packets of Live Link Face at their pace. A run is a separate process, so that processor time and
-memory are those of a run.
+The microphone is a null sink of a private PulseAudio server into which a recorded voice is played, so that PortAudio's
+callbacks, the audio process and the grid are those of a real microphone; "push" passes the same voice by function
+calls. The phone sends recorded packets of Live Link Face at their pace. A run is a separate process, so that processor
+time and memory are those of a run.
 """
 
 from __future__ import annotations
@@ -72,14 +72,14 @@ _MINUTES: Final = 10.0
 _IDLE_S, _IDLE_HZ = 5.0, 100.0
 _FILE_S: Final = 60.0
 _STARTS: Final = 5
-_BUSY_JITTER_MS: Final = 0.5  # of an empty loop, p99
+_BUSY_JITTER_MS: Final = 0.5  # p99 jitter of an empty loop above which the machine counts as busy
 _PIECE: Final = 160  # samples that are pushed at once
 _MEMORY_LOOKS: Final = 200
 _CHILD: Final = "from sfms_robot.lab.bench.live_bench import measured_run; measured_run()"
 
 
 def live(minutes: float, audio: Audio, say: Say) -> BenchResult:
-    """Measure all four parts, one after the other; Linux only. 0 minutes: ten.
+    """Measure all four parts, one after the other; Linux only. 0 minutes means ten minutes.
 
     Raises ConfigError if `audio` needs PulseAudio and it is not installed, BusError if the run fails.
     """
@@ -160,31 +160,31 @@ def _lines(result: Figures) -> Sequence[str]:
     ]
 
 
-# --- where the time goes between a sound and the servos --------------------------------------------------------------
+# --- stages of the time between a sound and the servos ---------------------------------------------------------------
 #
-# The stages come from the stamps that travel with samples, frames and plans:
+# The stages are computed from the time stamps of samples, frames and plans:
 #
-#     hop      from a sample to the end of the frame that the listener plans with
-#     block    until the source had that frame (the latency that it states)
-#     grid     until a tick gave it to the listener
-#     plan     until a tick had the listener's plan
-#     write    until the goals of that tick were written
+#     hop      from a sample to the end of the frame with which the listener plans
+#     block    until the source has that frame (the latency that the source states)
+#     grid     until a tick passes the frame to the listener
+#     plan     until a tick has the listener's plan
+#     write    until the goals of that tick are written
 #
-# Their sum is the time from a sample at the microphone to the first goal of a plan that uses it. It is taken for four
-# samples of each frame, ten milliseconds apart. A face counts from the arrival of its packet.
+# Their sum is the time from a sample at the microphone to the first goal of a plan that uses it. It is measured for
+# four samples of each frame, ten milliseconds apart. The delay of a face begins at the arrival of its packet.
 
 SETTLED_S: Final = 5.0  # until then the listener catches up with speech from before it was ready
 STAGES: Final = ("hop", "block", "grid", "plan", "write")
-_SAMPLES: Final = 4  # of a frame
+_SAMPLES: Final = 4  # measured samples of a frame
 _REMEMBERED: Final = 100  # frames
 
 
 class Stamps(Observer):
-    """An observer that adds up the stages. Its memory does not grow with the run.
+    """An observer that measures the stages. Its memory does not grow with the run.
 
     Args:
         latency_s: Returns the latency that the source states.
-        rate_hz: Ticks a second that are due.
+        rate_hz: Ticks due per second.
         now_s: Returns the time on the clock of `Tick.origin_s`.
     """
 
@@ -193,9 +193,9 @@ class Stamps(Observer):
     ) -> None:
         self._latency_s, self._rate_hz, self._now_s = latency_s, rate_hz, now_s
         self._origin_s = 0.0
-        self._heard: dict[int, tuple[float, float]] = {}  # frame -> when a tick gave it, latency of the source
+        self._heard: dict[int, tuple[float, float]] = {}  # frame -> time at which a tick passed it on, source latency
         self._waiting: deque[SpeakerFrame] = deque(maxlen=_REMEMBERED)
-        self._plans: list[tuple[float, float]] = []  # of this tick: made at, taken at
+        self._plans: list[tuple[float, float]] = []  # of this tick: made_at_s, time at which it was received
         self._stages = {name: Quantiles() for name in STAGES}
         self._sound, self._face = Quantiles(), Quantiles()
         self._last_face_s = -1.0
@@ -222,7 +222,7 @@ class Stamps(Observer):
         self._plans = []
 
     def _followed(self, made_at_s: float, taken_s: float, written_s: float) -> None:
-        """Count every frame up to `made_at_s`: the plan made from them is on the wire."""
+        """Record the stages of every frame up to `made_at_s`, since the plan made from them is on the wire."""
         given_s, latency_s = self._heard.get(round(made_at_s * FRAME_HZ), (self._origin_s + made_at_s, 0.0))
         heard_s = given_s - self._origin_s
         late_s = max(0.0, heard_s - made_at_s)
@@ -259,13 +259,13 @@ class Stamps(Observer):
 
 
 class LivePerson:
-    """A voice in a microphone and a phone in front of a face, while `live_person` lasts.
+    """A voice in a microphone and a phone in front of a face, inside the context of `live_person`.
 
     Attributes:
         environment: Variables with which a program finds the microphone.
         face: The value of `--face`.
         phone_silent: While it is set, the phone sends nothing.
-        server: The PulseAudio server of the microphone; None without.
+        server: The PulseAudio server of the microphone; None without a microphone.
     """
 
     def __init__(self, environment: Mapping[str, str], port: int, server: SoundServer | None) -> None:
@@ -305,7 +305,7 @@ def live_person(folder: Path, audio: Audio) -> Iterator[LivePerson]:
 
 
 def patient_head(folder: Path, deadline_s: float = READ_DEADLINE_S) -> Path:
-    """Write `HEAD` with the read deadline of `--port sim`: emulated servos share the cores of this computer."""
+    """Write `HEAD` with the read deadline of `--port sim`, since emulated servos share the cores of this computer."""
     place = folder / HEAD
     shutil.copytree(data_dir("configs") / "heads" / HEAD, place)
     raw = yaml.safe_load((place / "head.yaml").read_text(encoding="utf-8"))
@@ -361,7 +361,7 @@ def _run(environment: Mapping[str, str], **options: Any) -> Figures:
 
 
 def measured_run() -> None:
-    """Run in the child: a session with the options of the first argument (JSON); print the figures as JSON."""
+    """Run a session in the child process with the options of the first argument (JSON); print the figures as JSON."""
     options = json.loads(sys.argv[1])
     record = None if options["record"] is None else Path(options["record"])
     over = threading.Event()

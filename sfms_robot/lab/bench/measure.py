@@ -1,6 +1,4 @@
-"""Tools that the benches share: durations, rows beside a peer, figures of processes, and
-docs/science/performance.md.
-"""
+"""Shared tools of the benches: durations, rows with a peer, figures of processes, docs/science/performance.md."""
 
 from __future__ import annotations
 
@@ -31,7 +29,7 @@ LISTENER: Final = "sfms-small"
 Row = Figures
 Rows = dict[str, Row]  # by name
 Say = Callable[[str], None]  # prints a line of progress
-# -P: the current folder of the caller must not shadow the installation that is measured.
+# -P: the caller's current folder must not shadow the measured installation.
 MAIN: Final = ("-P", "-c", "from sfms_robot.cli.main import main; main()")
 _PAGE: Final = """# Measured by `sfms-robot bench`
 
@@ -48,7 +46,7 @@ class BenchResult:
     """The outcome of a bench.
 
     Attributes:
-        figures: Everything, as plain data (`--json`).
+        figures: All figures, as plain data (`--json`).
         table: The rows that are printed; `lines` are printed below them.
         passed: False makes the exit code 1.
     """
@@ -62,7 +60,7 @@ class BenchResult:
     def of_rows(
         cls, rows: Mapping[str, Row], lines: Sequence[str] = (), passed: bool = True, **more: Any
     ) -> BenchResult:
-        """Return the result of a bench whose figures are rows, and `more`; each row gets the name of this machine."""
+        """Return the result of a bench with the figures `rows` and `more`; each row gets the name of this machine."""
         rows = {name: {**each, "machine": machine()} for name, each in rows.items()}
         shown = ("median", "unit", "p99", "ratio")
         table = [
@@ -116,11 +114,11 @@ def times(call: Callable[[], object], count: int, clock: Callable[[], float] = t
 
 # --- another installation -------------------------------------------------------------------------------------------
 
-_COMPARED: Final = 3  # runs of each
+_COMPARED: Final = 3  # runs of each installation
 
 
 def environment(folder: Path) -> Mapping[str, str]:
-    """Return an environment in which Python finds the package in `folder` first. Raises ConfigError without one."""
+    """Return an environment in which Python finds the package in `folder` first. Raises ConfigError if it has none."""
     if not (folder / "sfms_robot" / "__init__.py").is_file():
         raise ConfigError(f"--against {folder}: no sfms_robot in it; a checkout, or a folder of packages that has one")
     return {**os.environ, "PYTHONPATH": str(folder.resolve())}
@@ -155,7 +153,7 @@ def compare_installations(name: str, against: Path) -> Rows:
 
 
 def package_environment() -> dict[str, str]:
-    """Return an environment in which a child process imports what this process imports."""
+    """Return an environment in which a child process imports from the same places as this process."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
@@ -188,12 +186,12 @@ def memory_mb(key: Literal["VmRSS", "VmHWM"], pid: int | Literal["self"] = "self
 
 
 def children_of(pid: int) -> list[int]:
-    """Return the ids of the running processes that `pid` started. Raises OSError as `processor_time_s`."""
+    """Return the ids of the running processes that `pid` started. Raises OSError like `processor_time_s`."""
     found: list[int] = []
     for task in Path(f"/proc/{pid}/task").iterdir():
         try:
             found += map(int, (task / "children").read_text(encoding="utf-8").split())
-        except OSError:  # this thread has ended meanwhile
+        except OSError:  # the thread has ended
             continue
     return found
 
@@ -240,7 +238,7 @@ def listener_process(folder: Path, engine: EngineName, repeats: int = 3) -> dict
 
 
 def listen_to_silence() -> None:
-    """Run in the child: feed silence to the listener of a folder, on one thread.
+    """Feed silence to the listener of a folder on one thread, in the child process.
 
     Prints "plan" at the first plan, then a JSON list of resident and peak memory [MB] after `_HEARD_FRAMES` more.
     """
@@ -265,11 +263,11 @@ def listen_to_silence() -> None:
 
 # --- docs/science/performance.md --------------------------------------------------------------------------------------
 
-_ON_A_GPU: Final = "\n## On a GPU\n"  # measured elsewhere: stays on the page
+_ON_A_GPU: Final = "\n## On a GPU\n"  # measured on other machines: this part of the page is kept
 
 
 def write_page(file: Path, rows: Mapping[str, Any], minutes: float) -> None:
-    """Write every row, and how it was measured, as a page; what it has of GPUs stays.
+    """Write every row, and the conditions of the measurement, as a page; keep the page's part about GPUs.
 
     Raises ConfigError if the file cannot be written.
     """

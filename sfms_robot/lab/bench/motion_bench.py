@@ -1,12 +1,12 @@
-"""Benches of motion: CPU time from a face to servo ticks, and two of a run in virtual time with synthetic plans.
+"""Benches of motion: CPU time from a face to servo ticks, and two benches in virtual time with synthetic plans.
 
 `retarget`: the parts of a tick, on recorded faces, without servos.
 
-`lead`: every channel of a synthetic listener swings at its own frequencies, and its plans come as those of the shipped
-listener. The delay of a joint is where the cross-correlation of its intended and its emulated angle peaks, interpolated
-between two ticks by a parabola. It includes everything: timeline, limiter, bus, servo.
+`lead`: every channel of a synthetic listener swings at its own frequencies, and its plans arrive like those of the
+shipped listener. The delay of a joint is the peak of the cross-correlation between its intended and its emulated angle,
+interpolated between two ticks by a parabola. It includes the timeline, the limiter, the bus and the servo.
 
-`memory`: resident memory of the servo process, with a recording, hour after hour: loop, bus, log and recorder.
+`memory`: resident memory of the servo process over hours of a run with a recording: loop, bus, log and recorder.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ from sfms_robot.runtime.clock import IDLE_FEED
 from sfms_robot.runtime.safety import Interrupt
 
 _HORIZON, _HOP = 8, 4  # frames of a plan, and between two plans
-_LATENCY_S: Final = 0.010  # from the last frame heard to the plan
+_LATENCY_S: Final = 0.010  # from the last received frame to the plan
 _SETTLED_S: Final = 1.5  # by then the head has eased in
-_FARTHEST_S: Final = 0.4  # largest delay that is looked for, in both directions
+_FARTHEST_S: Final = 0.4  # largest delay of the search, in both directions
 _WAVES: Final = 3  # sines of a channel
 _RANGE_HZ: Final = (0.3, 1.3)
 _MOVED_RAD: Final = math.radians(0.5)  # the delay of a joint that moves less is not measured
 _HOUR_S: Final = 3600.0
-_LOOKS: Final = 20  # at memory, per hour
+_LOOKS: Final = 20  # measurements of memory per hour
 _RETARGET_HZ: Final = 100.0
 _RETARGET_TICKS: Final = 2000
 
@@ -88,7 +88,7 @@ class Waves:
 
 
 class _Shafts(Observer):
-    """An observer that reads the shafts of the emulated servos, also of those whose bus reports no position."""
+    """An observer that reads the shafts of the emulated servos, even if their bus reports no positions."""
 
     def __init__(self, head: Head, chains: Mapping[str, Chain], clock: Clock) -> None:
         self._head, self._chains, self._clock = head, chains, clock
@@ -107,7 +107,7 @@ class _Shafts(Observer):
 
 
 def lead(head: str = HEAD) -> Rows:
-    """Return rows of the delay of each joint with lead [ms]; the peer is the delay without."""
+    """Return rows of the delay of each joint with lead [ms]; the peer is the delay without lead."""
     joints, *both_s = delays(head)
     moved = np.isfinite(both_s[0])
     led, unled = (np.abs(each[moved]) * 1e3 for each in both_s)
@@ -148,7 +148,7 @@ def _delays(name: str, share: float, duration_s: float) -> tuple[Sequence[str], 
 
 
 def delay_ticks(meant: Doubles, seen: Doubles, farthest: int) -> Doubles:
-    """Return by how many ticks (J,) the columns of `seen` (T, J) follow those of `meant`; NaN if one hardly moves.
+    """Return the delay in ticks (J,) of the columns of `seen` (T, J) after those of `meant`; NaN if one hardly moves.
 
     The correlation coefficient uses the same middle part of `meant` at every shift up to `farthest`.
     """
@@ -172,10 +172,10 @@ def delay_ticks(meant: Doubles, seen: Doubles, farthest: int) -> Doubles:
 
 
 def memory(hours: float = 4.0, head: str = "interbotix_wxxms") -> Rows:
-    """Return the growth of resident memory after the first hour [MB], beside the memory then; Linux only.
+    """Return the growth of resident memory after the first hour [MB]; the peer is the memory at that time. Linux only.
 
-    `head`: a name or a folder; the usual one has two servos, so that hours pass quickly. Raises BusError if the run
-    ends early.
+    `head`: A name or a folder; the default has two servos, so that hours pass quickly. Raises BusError if the run ends
+    early.
     """
     looks = ResidentMemory(_HOUR_S / _LOOKS)
     with TemporaryDirectory() as folder:
@@ -226,7 +226,7 @@ def retarget() -> Rows:
 
 def _recorded_plans() -> list[Plan]:
     """Return recorded faces as plans of 8 frames, a new one every 4, from 0 s to past the last tick."""
-    from sfms_robot.app.head.head_check import named_faces  # loads scipy, whose memory is not that of a run
+    from sfms_robot.app.head.head_check import named_faces  # loads scipy, whose memory is not part of a run
 
     need = int(_RETARGET_TICKS / _RETARGET_HZ / FRAME_S) + 2 * _HORIZON
     clips = [clip for _, clip in named_faces() if len(clip) > _HORIZON]

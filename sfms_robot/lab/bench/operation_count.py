@@ -1,8 +1,8 @@
 """The cost of torch code, counted as it runs, independent of the machine.
 
 An operation is one multiplication or addition of a matrix product, a convolution or an attention (torch's formulas), or
-one number produced by any other call. Bytes are those of all tensors that each call reads and writes, as without
-caches: the traffic to memory for large tensors, an upper bound for small ones.
+one number produced by any other call. Bytes are those of all tensors that each call reads and writes, as if there were
+no caches: the memory traffic for large tensors, an upper bound for small ones.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
     """A context manager that counts the calls inside it.
 
     Attributes:
-        matrix, other: Operations of products, and numbers from other calls.
+        matrix, other: Operations of products, and numbers produced by other calls.
         bytes, calls: Bytes moved and calls made, views of tensors excluded.
         drawn: Random numbers.
     """
@@ -33,7 +33,7 @@ class OperationCount(TorchDispatchMode):  # type: ignore[no-untyped-call]
         super().__init__()  # type: ignore[no-untyped-call]
         self._products = FlopCounterMode(display=False)
         aten, self._known = torch.ops.aten, self._products.flop_registry
-        self._known |= {  # torch has the formulas of attention for other devices' kernels alone
+        self._known |= {  # torch has formulas of attention only for the kernels of other devices
             aten._scaled_dot_product_flash_attention_for_cpu: self._known[aten._scaled_dot_product_flash_attention],
             aten._scaled_dot_product_flash_attention_for_cpu_backward: self._known[
                 aten._scaled_dot_product_flash_attention_backward

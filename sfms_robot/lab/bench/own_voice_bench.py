@@ -1,8 +1,8 @@
-"""`bench own-voice`: the person missed while a head speaks and moves, and its own sound taken for the person.
+"""`bench own-voice`: errors while a head speaks and moves: the person missed, its own sound taken for the person.
 
 Recorded calls of two people become scenes: the caller in a room, the agent from the head's loudspeaker, gear noise from
-the joint speeds of a recorded run. The clean tracks say who speaks; 100 ms around every change do not count. Sound is
-float64 at 16 kHz. Levels are root mean squares over the frames with speech.
+the joint speeds of a recorded run. The clean tracks determine who speaks; 100 ms around every change do not count.
+Sound is float64 at 16 kHz. Levels are root mean squares over the frames with speech.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sfms_robot.signals.audio import read_audio
 from sfms_robot.signals.echo import EchoCanceller
 from sfms_robot.signals.own_voice_gate import WINDOW, OwnVoiceGate, SpeechProbability
 
-# Parameters were chosen on these calls, which are never reported on, with other gears (seed 1) and other movements.
+# The calls on which the parameters were chosen, with other gears (seed 1) and movements. They are never in the results.
 CHOSEN_ON: Final = ("hvb_01cefd6f5c044a6f", "hvb_02e41649e7c441fd", "hvb_03a17cc36d474151")
 _NEAR_FRAMES: Final = 3  # 100 ms, in whole frames
 # Size in metres and the time in which sound decays by 60 dB.
@@ -38,9 +38,9 @@ _PERSON_DB: Final = -30.0  # at the microphone
 _PERSON_M, _LOUDSPEAKER_M, _MOTORS_M = (1.2, 0.3, 0.2), (0.02, 0.0, -0.12), (0.0, 0.06, -0.05)  # from the microphone
 _LOUDSPEAKER_DELAY: Final = 640  # samples from the reference to the loudspeaker, 40 ms
 _HISS_DB: Final = -72.0
-_ORDER: Final = 30  # of reflections, at most
+_ORDER: Final = 30  # highest order of reflections
 _TRUTH_GAINS: Final = (2.0, 16.0)  # for clean speech; independent of the gains of the gate
-_ALTERNATE_FRAMES: Final = 100  # a voice that talks over the person goes on and off at this pace
+_ALTERNATE_FRAMES: Final = 100  # a voice that talks over the person is on and off for this many frames each
 _TITLES: Final = {
     "own_voice_taken": "own voice taken for the person",
     "person_missed": "person missed",
@@ -52,9 +52,9 @@ _TITLES: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class VoiceCondition:
-    """Levels relative to the person's [dB], None: absent. Without `person` the levels are the same, without speech.
+    """Levels relative to the person's [dB]; None: absent. Without `person` the levels stay, but the person is silent.
 
-    `talks_over`: the head's voice without its pauses, four seconds on and four off, regardless of the person.
+    `talks_over`: The head's voice without its pauses, four seconds on and four off, regardless of the person.
     """
 
     room: str = "office"
@@ -104,7 +104,7 @@ def measure(data: Path | None = None) -> BenchResult:
 
 
 def own_voice(folder: Path | None = None, conditions: Sequence[VoiceCondition] = CONDITIONS) -> dict[str, Any]:
-    """Measure conditions over the calls of `folder` (NAME_caller, NAME_agent), or over the two that ship.
+    """Measure conditions over the calls of `folder` (NAME_caller, NAME_agent), or over the two shipped calls.
 
     Calls on which parameters were chosen are left out. Raises ConfigError if no call is left.
     """
@@ -119,7 +119,7 @@ def own_voice(folder: Path | None = None, conditions: Sequence[VoiceCondition] =
 
 
 def call_names(folder: Path) -> list[str]:
-    """Return the calls in a folder, without those that parameters were chosen on."""
+    """Return the calls in a folder, without those on which parameters were chosen."""
     names = sorted({path.stem.removesuffix("_caller") for path in folder.glob("*_caller.*")} - set(CHOSEN_ON))
     if not names:
         raise ConfigError(f"{folder}: has no NAME_caller.flac with NAME_agent.flac (or .wav) to report on")
@@ -171,7 +171,7 @@ def _framed(samples: Floats) -> Floats:
 
 
 def _near_change(active: Bools) -> Bools:
-    """Return the frames (n,) within `_NEAR_FRAMES` of a change, before it or from it on."""
+    """Return a mask (n,) of the `_NEAR_FRAMES` frames before each change and as many from the change on."""
     near = np.zeros(len(active), bool)
     for change in np.flatnonzero(active[1:] != active[:-1]) + 1:
         near[max(0, change - _NEAR_FRAMES) : change + _NEAR_FRAMES] = True
@@ -182,7 +182,7 @@ def _near_change(active: Bools) -> Bools:
 
 
 class Call:
-    """Two people on one clock: samples (n * 640,), and who speaks in each of n frames, from the clean tracks.
+    """Two people on one clock: samples (n * 640,), and speech of each person in n frames, from the clean tracks.
 
     NAME_caller is the person and NAME_agent the head, as .flac or .wav. Raises ConfigError if one is missing.
     """
@@ -202,7 +202,7 @@ def _track(folder: Path, name: str) -> Doubles:
 
 
 def _speaks(track: Doubles) -> Bools:
-    """Return (n,) of a clean track (n * 640,): the network finds speech likely around the middle of the frame."""
+    """Return a mask (n,) of a clean track (n * 640,): the network finds speech likely at the middle of the frame."""
     loud = track / max(1e-9, float(np.sqrt(np.mean(track**2)))) * 10 ** (-26 / 20)
     found = np.array(SpeechProbability(_TRUTH_GAINS).push(loud.astype(np.float32)))
     middles = (np.arange(len(track) // FRAME_SAMPLES) + 0.5) * FRAME_SAMPLES / WINDOW - 0.5
@@ -211,7 +211,7 @@ def _speaks(track: Doubles) -> Bools:
 
 
 class HeardScene:
-    """A call as the head's microphone hears it.
+    """A call as the head's microphone records it.
 
     Attributes:
         mic, reference: (n * 640,) float32.
@@ -236,7 +236,7 @@ class HeardScene:
             late = np.concatenate([np.zeros(_LOUDSPEAKER_DELAY), own])[: len(own)]
             mic += _at_level(late, own_echo, self.own_speaks, condition.own_db)
         if condition.motors_db is not None:
-            file = data_dir("sim") / "conversations" / "joint_speeds.npz"  # as commanded to a listening head
+            file = data_dir("sim") / "conversations" / "joint_speeds.npz"  # commanded speeds of a listening head
             speed = np.load(file)["speed_rad_s"].astype(np.float64)
             to_and_fro = np.concatenate([speed, speed[::-1]])
             self.speed_rad_s = np.resize(to_and_fro, (n, speed.shape[1]))

@@ -1,15 +1,15 @@
-"""`bench serve`: how many heads one server answers in time, and the cost of each.
+"""`bench serve`: the number of heads that one server answers in time, and the cost of each.
 
-Heads send frames of a recorded person 25 times a second, each from a different place in the recording and at a
-different phase, as bytes. Measured is the time from the arrival of a frame to the departure of its plan, as bytes
-again: the way to the process that steps, parsing, waiting for a batch, the batch, the way back. The network is not part
-of it (`bench live` and a run's report have that). The processes are those of `serve`; the frames are sent from this
-machine too.
+Heads send frames of a recorded person 25 times a second as bytes, each head from a different place in the recording and
+at a different phase. The bench measures the time from the arrival of a frame to the departure of its plan, again as
+bytes: the way to the process that steps, parsing, waiting for a batch, the batch, the way back. The network is not
+included (`bench live` and a run's report include it). The processes are those of `serve`; the frames are also sent from
+this machine.
 
 The peer is the same listener serving one head at a time on one core, as a server without batches would.
 
-`--device cuda`: p99 and frames a second at 64, 256 and 1,024 heads, and what one batch of all of them takes, without
-the messages: in its networks, and in Python beside them.
+`--device cuda`: p99 and frames a second at 64, 256 and 1,024 heads, and the duration of one batch of all these heads
+without the messages: in its networks, and in total with Python.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _MOST: Final = 512
 GPU_HEADS: Final = (64, 256, 1024)
 GPU_NAMES: Final = ("arig-small", "sfms-small")
 _BATCH_FRAMES: Final = 8
-_NOT_KEPT_UP_MS: Final = 10_000.0  # stands for a server that skipped frames
+_NOT_KEPT_UP_MS: Final = 10_000.0  # delay that is reported if the server skipped frames
 _ANSWER_S: Final = 30.0
 
 
@@ -97,7 +97,7 @@ def _on_gpu(say: Say, device: Device) -> BenchResult:
 
 
 def _batch_ms(listener: Any, heads: int) -> dict[str, float]:
-    """Return what a batch of one frame of `heads` heads takes, on average over plans: in its networks, and in all."""
+    """Return the time [ms] of a batch of one frame of each head, averaged over plans: in its networks, and in total."""
     engine, spent_s = listener.engine, list[float]()
     run = engine.run
 
@@ -167,7 +167,7 @@ def _served(name: str, say: Say) -> Figures:
 
 
 def _largest(in_time: Callable[[int], bool], start: int) -> int:
-    """Return the most heads for which `in_time`, 0 for none: by doubling or halving, then bisection to a twentieth."""
+    """Return the most heads that are `in_time`, 0 for none: by doubling or halving, then bisection to a twentieth."""
     low, high = 0, 0
     heads = start
     while not high or not low:
@@ -223,7 +223,7 @@ def _loaded(pool: WorkerPool, load: _Load, messages: Sequence[bytes], heads: int
 
 
 class _Load:
-    """Receives the server's messages and keeps the arrival of each plan."""
+    """A receiver of the server's messages that stores the arrival time of each plan."""
 
     def __init__(self) -> None:
         self.begin()

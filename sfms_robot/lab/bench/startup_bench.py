@@ -1,11 +1,11 @@
-"""`bench startup`: start and end of commands, seen from outside, so that any installation can be measured.
+"""`bench startup`: start and end of commands, observed from outside, so that any installation can be measured.
 
-    help, wrong_port, wrong_head    until the process is over
-    first_goal                      from typing `run` until its servos have torque, in the tick of the first goal
-    exit                            from its last byte on the wire until the process is over
+    help, wrong_port, wrong_head    time until the process ends
+    first_goal                      time from typing `run` until its servos have torque, in the tick of the first goal
+    exit                            time from its last byte on the wire until the process ends
     resident                        peak memory of the servo process, without the listener's process
 
-`run` drives emulated servos, which are looked at every few milliseconds.
+`run` drives emulated servos, whose state is read every few milliseconds.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def start_and_end(
 ) -> dict[str, float]:
     """Listen for one second on emulated servos, in real time; return `first_goal`, `exit` and `resident`.
 
-    `more`: words of `run`. `first_goal` is NaN without one.
+    `more`: Further arguments of `run`. `first_goal` is NaN if there was no goal.
     """
     head = load_head(HEAD)
     with launch(emulated(head)["main"]) as chain:

@@ -1,16 +1,16 @@
-"""`bench throttle`: a head that listens on a quarter of one core, beside the same on all of this machine.
+"""`bench throttle`: a head that listens on a quarter of one core, compared with the same on all of this machine.
 
     free    the default head listens to a recorded person, in real time
-    held    the same, with the run and its listener held to `SHARE` of one core
+    held    the same, with the run and its listener limited to `SHARE` of one core
 
-A process and everything it starts stay on one core and run for a share of every `_SLICE_S`; SIGSTOP and SIGCONT stop
-them for the rest. A slower computer is slow evenly; here a tick may find its process stopped and be late by up to a
-slice for that alone. A process that was late gets no extra time, so the share is never exceeded. Linux.
+The process and all its descendants stay on one core and run for a share of every `_SLICE_S`; SIGSTOP and SIGCONT stop
+them for the rest. A slower computer is evenly slow, while here a tick can be late by up to a slice only because its
+process is stopped. A process that was late gets no extra time, so the share is never exceeded. Linux only.
 
-The servos are emulated outside of the held processes, as real servos are not slower either, and are observed there.
-However slow the computer is, no command outside the limits may reach them, and the states have to be those of
+The servos are emulated outside of the held processes, since real servos are not slower either, and are observed there.
+On a computer of any speed no command outside the limits may reach the servos, and the states have to be those of
 docs/safety.md. Each transition that its table lacks, each silent or late listener that is not named, each missing
-reason and torque that is left on is one line, and makes the exit code 1.
+reason and torque that is left on adds one line and makes the exit code 1.
 """
 
 from __future__ import annotations
@@ -60,24 +60,24 @@ Change = tuple[float, str, tuple[str, ...]]  # time_s, state, why
 
 SHARE: Final = 0.25
 _RUN_S: Final = 20.0
-_TOLERANCE_S: Final = 0.5  # of a state: the loop checks when it is awake
-_LOOK_S: Final = 0.5  # between two looks at the servos
-_LIMIT_S: Final = 120.0  # for a run and its start
-_OUTSIDE_S: Final = 2.0  # more time to ease in, for joints found outside their range
-_SLICE_S: Final = 0.008  # not a multiple of a tick, so that ticks meet different places of a slice
-_PROCESSES_S: Final = 0.2  # between two looks for new processes
-OUT, SAID = "out", "said"  # files
+_TOLERANCE_S: Final = 0.5  # for the times of states: the loop checks them only while it runs
+_LOOK_S: Final = 0.5  # between two readings of the servos
+_LIMIT_S: Final = 120.0  # longest time of a run with its start
+_OUTSIDE_S: Final = 2.0  # additional time to ease in, for joints found outside their range
+_SLICE_S: Final = 0.008  # not a multiple of a tick, so that ticks fall on different places of a slice
+_PROCESSES_S: Final = 0.2  # between two searches for new processes
+OUT, SAID = "out", "said"  # files of stdout and stderr
 _CHILD: Final = "from sfms_robot.lab.bench.throttle_bench import observed_run; observed_run()"
 
 
 @dataclass(frozen=True, kw_only=True)
 class ObservedRun:
-    """A run.
+    """A run and the observations of its servos.
 
     Attributes:
         report: The report of the run.
-        plans_s: Arrival of each plan, and its last frame, in loop time.
-        looks, outside: Looks at servos, and how many of them found a goal outside the joint's range.
+        plans_s: Arrival of each plan, and time of its last frame, in loop time.
+        looks, outside: Readings of servos, and the number of them with a goal outside the joint's range.
         torque: Servos that have torque after the run.
     """
 
@@ -141,7 +141,7 @@ def state_problems(changes: Sequence[Change], plans_s: Sequence[tuple[float, flo
 
     Args:
         changes: State changes, in order.
-        plans_s: Arrival of each plan, and its last frame.
+        plans_s: Arrival of each plan, and time of its last frame.
     """
     found = []
     for (_, before, _), (at_s, after, _) in pairwise(changes):
@@ -159,7 +159,7 @@ def state_problems(changes: Sequence[Change], plans_s: Sequence[tuple[float, flo
     over_s = [at_s for at_s, name, _ in changes if name in ("stopping", "stopped", "fault")][:1]
     in_time_s = [came_s for place, (came_s, last_s) in enumerate(plans_s) if not place or came_s <= last_s]
     for since_s, until_s in pairwise([*in_time_s, *over_s]):
-        # A late plan shows that the listener is late only when it arrives, so the limit is the sum of both times.
+        # A late plan shows only on its arrival that the listener is late, so the limit is the sum of both times.
         if until_s - since_s > HUNG_S + LATE_S + _TOLERANCE_S and not any(
             "listener" in why and at_s <= until_s and end_s >= since_s
             for (at_s, _, why), end_s in zip(changes, ends_s, strict=True)
@@ -190,7 +190,7 @@ def _observed(share: float | None) -> ObservedRun:
 
 
 class _Goals:
-    """Counts goals of the emulated servos outside their joints' ranges, bypassing the bus."""
+    """A counter of goals outside the joints' ranges, read from the emulated servos without the bus."""
 
     def __init__(self, chain: Chain) -> None:
         joints = load_head(HEAD).joints
@@ -211,7 +211,7 @@ class _Goals:
 
 
 def observed_run() -> None:
-    """Run in the child: a session with the options of the first argument (JSON); print report and plan arrivals."""
+    """Run a session in the child process with the options of the first argument (JSON); print report and plan times."""
     plans = _Plans()
     options = RunOptions(listener=LISTENER, audio=DEFAULT_SPEAKER, duration_s=_RUN_S, **json.loads(sys.argv[1]))
     report = run(options, observers=[plans])
@@ -219,7 +219,7 @@ def observed_run() -> None:
 
 
 class _Plans(Observer):
-    """An observer of when plans arrived, and of their last frames."""
+    """An observer of the arrival times of plans, and of the times of their last frames."""
 
     def __init__(self) -> None:
         self.came_s: list[tuple[float, float]] = []
@@ -245,7 +245,7 @@ def check() -> None:
 
 @contextmanager
 def _on_cores(cores: set[int]) -> Iterator[None]:
-    """Keep this thread, and everything it starts, on these cores while inside."""
+    """Keep this thread, and everything that it starts, on these cores inside the context."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, cores)
     try:
@@ -269,13 +269,13 @@ def processes_of(pid: int) -> list[int]:
 def held(
     arguments: Sequence[str], share: float | None, folder: Path, environment: Mapping[str, str]
 ) -> Iterator[Process]:
-    """Run `sys.executable ARGUMENTS`, held with all its descendants to a share of one core; kill it on leaving.
+    """Run `sys.executable ARGUMENTS`, limited with all its descendants to a share of one core; kill it on exit.
 
     Args:
-        arguments: The command.
+        arguments: Arguments of the command.
         share: Share of a core; None: no limit.
-        folder: What the command prints goes into its files `OUT` and `SAID` (stderr).
-        environment: Of the command.
+        folder: Folder of the files `OUT` (stdout) and `SAID` (stderr) with the output of the command.
+        environment: Environment of the command.
     """
     cores = os.sched_getaffinity(0)
     first = {min(cores)}
@@ -302,7 +302,7 @@ def held(
 
 
 def _hold(process: Process, share: float, cores: set[int], over: threading.Event) -> None:
-    """Stop and continue a process and its descendants in slices until the end; leave them running."""
+    """Stop and continue a process and its descendants in slices until `over` is set or it ends; leave them running."""
     pids, looked_s, begins_s = [process.pid], 0.0, time.monotonic()
 
     def send(number: signal.Signals) -> None:

@@ -1,15 +1,15 @@
-"""`bench live --torture`: a live run with faults in real time: what it misses, what it reports, how it ends.
+"""`bench live --torture`: a live run with faults in real time: its missed ticks, its reports and its end.
 
-In random order:
+The faults come in random order:
 
     killed    the listener's process gets SIGKILL
-    stopped   it gets SIGSTOP and no SIGCONT
-    cut       a source is gone for some seconds: in turn the microphone is unplugged and the phone falls silent
-    unplugged a servo falls silent for some seconds
+    stopped   the listener's process gets SIGSTOP and no SIGCONT
+    cut       a source is gone for some seconds: the microphone is unplugged, or, every other time, the phone is silent
+    unplugged a servo is silent for some seconds
 
 After each fault the run has to become `degraded` for that reason within the time of docs/safety.md, and recover before
-the next fault. It must not miss more ticks than a calm stretch does. At the end the recording must hold the same
-states, and the torque of every servo must be off.
+the next fault. It must not miss more ticks than in calm stretches. At the end the recording must have the same states,
+and the torque of every servo must be off.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ from sfms_robot.lab.bench.throttle_bench import OUT, SAID, Process, held
 KINDS: Final = ("killed", "stopped", "cut", "unplugged")
 LONGEST_S: Final = {"killed": 1.0, "stopped": 1.0, "cut": 1.0, "unplugged": 1.5}
 _MINUTES: Final = 30.0
-_EACH: Final = 20  # of a kind, in half an hour
-_LOOK_S: Final = 0.1  # between two looks at the status: a state may be seen that much late
+_EACH: Final = 20  # faults of a kind in half an hour
+_LOOK_S: Final = 0.1  # between two requests of the status; a state may be seen late by this time
 _TOLERANCE_S: Final = 0.3
-_AWAY_S: Final = 3.0  # of a source or a servo
+_AWAY_S: Final = 3.0  # absence of a source or a servo
 _START_S: Final = 60.0
-_AFTER_S: Final = 2.0  # ticks missed within this time after a blow belong to it
+_AFTER_S: Final = 2.0  # ticks missed within this time after a blow count as caused by it
 _END_S: Final = 30.0
 _SEED: Final = 0
 
@@ -69,10 +69,10 @@ class Blow:
     """One fault. Times in seconds; None: not within its slot.
 
     Attributes:
-        why: The reason with which the run has to be degraded.
+        why: The reason that the run has to report as degraded.
         at_s: Loop time.
-        degraded_s: Until the run reported the right reason.
-        well_s: From then, or from the return of the source or servo, until that reason was gone.
+        degraded_s: Time until the run reported the right reason.
+        well_s: Time from then, or from the return of the source or servo, until that reason was gone.
     """
 
     kind: str
@@ -89,7 +89,7 @@ class Blow:
 
 
 def measure(say: Say, minutes: float = 0.0, audio: Audio = "mic", torture: bool = False) -> BenchResult:
-    """Measure a live run, if `torture` with faults in proportion to the time; Linux only. 0 minutes: the usual length.
+    """Measure a live run, if `torture` with faults in proportion to its length; Linux only. 0 minutes: default length.
 
     Raises ConfigError without PulseAudio, BusError if the run does not begin.
     """
@@ -158,9 +158,9 @@ class _Victim:
         return "phone", "face", self.person.phone_silent.clear
 
     def watch(self, limit_s: float, why: str = "", wanted: bool = True) -> float | None:
-        """Return after how many seconds the run is degraded by `why` (or, not `wanted`, is not); None after the limit.
+        """Return the seconds until the run is degraded by `why` (if not `wanted`: no longer is); None at the limit.
 
-        Without `why` watch the status for `limit_s`.
+        Without `why`, read the status for `limit_s` and return None.
         """
         began_s = time.monotonic()
         while (taken_s := time.monotonic() - began_s) < limit_s:
@@ -257,9 +257,9 @@ def _judged(blows: Sequence[Blow], report: Figures, folder: Path, torque: Sequen
 
 
 def missed_ticks(times_s: Any, blows_s: Sequence[float]) -> dict[str, float]:
-    """Count ticks missing from the recording near blows and elsewhere, and how many chance explains near blows.
+    """Count ticks missing from the recording after blows and elsewhere, and those expected after blows by chance.
 
-    Expected is the mean of the rest plus three standard deviations of a Poisson count.
+    The expected number is the mean of the rest plus three standard deviations of a Poisson count.
     """
     gaps = np.diff(times_s)
     lost = np.round(gaps / float(np.median(gaps))).astype(int) - 1
@@ -278,7 +278,7 @@ def missed_ticks(times_s: Any, blows_s: Sequence[float]) -> dict[str, float]:
 def _running(folder: Path, chain: Chain, person: LivePerson, audio: Audio) -> Iterator[tuple[Process, int]]:
     """Start `run` and yield its process and status port once the listener listens.
 
-    Raises BusError when the run ends before that, or it takes too long.
+    Raises BusError if the run ends before that, or if it does not listen in time.
     """
     port = free_port()
     words = [

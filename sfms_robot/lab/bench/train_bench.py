@@ -1,8 +1,8 @@
-"""`bench train`: the share of a training step, on one core, that is not the model.
+"""`bench train`: the share of a training step, on one core, that is spent outside the model.
 
-The model is what lies between the first call of one of its modules and the end of the backward pass. The rest draws
-windows and noise, cuts and changes them, clips and updates. Steps are those of the shipped files, on made-up frames
-(`learning.train_runs`).
+The time of the model is from the first call of one of its modules to the end of the backward pass. The rest draws
+windows and noise, cuts and changes them, clips gradients and updates weights. Steps are those of the shipped files, on
+made-up frames (`learning.train_runs`).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from sfms_robot.lab.learning.training_loop import Gradients, make_step
 from sfms_robot.listeners.registry import one_thread
 
 FILES: Final = ("arig", "sfms-small")
-MOST_BESIDE: Final = {"arig": 0.15}  # share of a step, by job
+MOST_BESIDE: Final = {"arig": 0.15}  # largest allowed share of a step outside the model, by job
 
 
 def measure(say: Say, steps: int = 12) -> BenchResult:
-    """Measure `steps` of every job of the shipped files, after one that is not measured. Blocks for half a minute."""
+    """Measure `steps` of every job of the shipped files, after a first unmeasured step. Blocks for half a minute."""
     rows = Rows()
     one_thread()
     for file in FILES:
@@ -44,7 +44,7 @@ def measure(say: Say, steps: int = 12) -> BenchResult:
 
 
 def _measured(job: Job, steps: int) -> Row:
-    """Return the row of a job: what is not the model beside the whole step."""
+    """Return the row of a job: the time outside the model; the peer is the whole step."""
     job.model.train()
     timed, generator = _TimedGradients(job), torch.Generator().manual_seed(job.seed)
     whole_ms, beside_ms = [], []
@@ -61,7 +61,7 @@ def _measured(job: Job, steps: int) -> Row:
 
 
 class _TimedGradients(Gradients):
-    """Gradients that keep when the model was first called in a step, and for how long it was at work."""
+    """Gradients that record the time of the model's first call in a step, and the duration of the model's work."""
 
     def __init__(self, job: Job) -> None:
         super().__init__(job, ProcessGroup(), 1, Path())
@@ -75,12 +75,12 @@ class _TimedGradients(Gradients):
         return time.perf_counter()
 
     def called(self, module: nn.Module, inputs: Any) -> None:
-        """Note the first call of a module of the model."""
+        """Record the time of the first call of a module of the model."""
         if self.first_s is None and module in self._modules:
             self.first_s = time.perf_counter()
 
     def of(self, step: int, generator: torch.Generator) -> Tensor:
-        """Return what `Gradients.of` returns."""
+        """Return the result of `Gradients.of`."""
         found = super().of(step, generator)
         self.model_s = 0.0 if self.first_s is None else time.perf_counter() - self.first_s
         return found

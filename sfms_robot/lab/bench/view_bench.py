@@ -4,11 +4,11 @@
 
 The default head runs on emulated servos with its page, and three plain WebSocket clients in a separate process read all
 that the page sends. The cost is the processor time of the page's process and of the threads of the run that send to it,
-by windows. The loop's own part, some microseconds of packing 25 times a second, and the processes of listener, servos
-and clients are not counted. A halt counts from the click, a message of a fourth client, until the goals of the first
-braking tick are written.
+for each window. The loop's own part, some microseconds of packing 25 times a second, and the processes of listener,
+servos and clients are not counted. The delay of a halt is the time from the click, a message of a fourth client, until
+the goals of the first braking tick are written.
 
-`bench outputs`: late ticks of a run with four outputs beside the same without, and the processor time of their threads.
+`bench outputs`: late ticks of a run with four outputs and of one without, and the processor time of the output threads.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _CLIENTS: Final = 3
 _MOST_CPU: Final = 3.0  # % of a core
 _MOST_OUTPUTS_CPU: Final = 5.0  # % of a core
 _MOST_HALT_MS: Final = 100.0
-_BETWEEN_S: Final = 2.3  # a halt and the way back to the face; not a multiple of a tick
+_BETWEEN_S: Final = 2.3  # time for a halt and the return to the face; not a multiple of a tick
 _LIMIT_S: Final = 60.0
 _CLOSE_S: Final = 5.0
 
@@ -129,10 +129,10 @@ def outputs(say: Say) -> BenchResult:
 
 
 class _Watch(Observer):
-    """An observer that notes when the run is under way, and each first tick that brakes.
+    """An observer that detects when the run has settled, and the first braking tick of each halt.
 
     Attributes:
-        halted: Set at that tick, at `halted_s` of `time.monotonic`.
+        halted: Set at that tick; `halted_s` is its time on `time.monotonic`.
     """
 
     def __init__(self) -> None:
@@ -191,7 +191,7 @@ def _read_all(visitor: ClientConnection) -> None:
 
 
 def clients() -> None:
-    """Read the page of the first message, in the clients' process, until its pipe ends."""
+    """Read the page whose address is the first message, in the clients' process, until its pipe ends."""
     parent = ParentPipe()
     url = parent.receive()
     for _ in range(_CLIENTS):

@@ -25,17 +25,17 @@ from sfms_robot.lab import Figures
 from sfms_robot.lab.bench.measure import BenchResult, Row, Rows, percentiles, times
 from sfms_robot.sources.webcam import Landmarker, Picture, SeenFace, open_webcam
 
-SEEN_CORRELATION: Final = 0.8  # a channel counts as seen if it follows this well, and this far
+SEEN_CORRELATION: Final = 0.8  # a channel counts as seen from this correlation and this slope on
 SEEN_SLOPE: Final = 0.1
 _PICTURE_HZ: Final = 30
 _SHAPE_LEVELS: Final = (0.0, 1 / 3, 2 / 3, 1.0)
 _TURN_LEVELS_RAD: Final = (-0.35, -0.2, -0.1, 0.1, 0.2, 0.35)
 _MOVE_LEVELS_M: Final = (-0.1, -0.05, 0.05, 0.1)
-_MOVES: Final = {"x": (-1, 0, 0), "y": (0, -1, 0), "z": (0, 0, 1)}  # x towards the camera, y to their own left, z up
+_MOVES: Final = {"x": (-1, 0, 0), "y": (0, -1, 0), "z": (0, 0, 1)}  # x to the camera, y to the person's left, z up
 _YAWS_RAD: Final = (0.0, 0.15)
 _TREMBLE_PICTURES: Final = 20
 _NOISE: Final = 4.0  # of 255, 1 sigma
-_NOISES: Final = 8  # different ones
+_NOISES: Final = 8  # different pictures of noise
 _SETTLE: Final = 2  # pictures of one face: MediaPipe tracks its landmarks from picture to picture
 _TIMED: Final = 100
 _VIDEO_S: Final = 4.0
@@ -48,7 +48,7 @@ _EYES: Final = {
 
 
 class _Sight:
-    """Draws faces and returns what MediaPipe sees of them: motion (58,), then place (3,)."""
+    """A virtual camera that draws faces, with MediaPipe that measures them: motion (58,), then place (3,)."""
 
     def __init__(self) -> None:
         self._camera, self._landmarker = VirtualWebcam(), Landmarker()
@@ -60,7 +60,7 @@ class _Sight:
         return self._camera.picture(motion, place_m)
 
     def seen(self, drawn: Picture) -> Doubles:
-        """Return (61,). Raises ConfigError if MediaPipe finds no face: the bench can then measure nothing."""
+        """Return motion and place (61,). Raises ConfigError if MediaPipe finds no face: no measurement is possible."""
         faces: list[SeenFace] = []
         for _ in range(_SETTLE):
             self._looked += 1
@@ -127,7 +127,7 @@ def _followed(sight: _Sight, names: Sequence[str]) -> tuple[Rows, Rows]:
             asked = np.array(_MOVE_LEVELS_M)
             spots = np.array(PLACE_M) + np.multiply.outer(asked, _MOVES[name])
             came = np.array([sight.seen(sight.draw(face_of(), (spot[0], spot[1], spot[2]))) - rest for spot in spots])
-            axis = "xyz".index(name)  # x and y of `place_m` run against the person's
+            axis = "xyz".index(name)  # x and y of `place_m` have the opposite direction of the person's
             place[name] = _fit(asked if name == "z" else -asked, came[:, MOTION_DIM + axis])
         else:
             asked = np.array(_TURN_LEVELS_RAD)
@@ -150,7 +150,7 @@ def _followed(sight: _Sight, names: Sequence[str]) -> tuple[Rows, Rows]:
 
 
 def _fit(asked: Doubles, came: Doubles) -> Row:
-    """Return correlation and slope; 0 for both if nothing came at all."""
+    """Return correlation and slope; 0 for both if `came` is constant."""
     if not np.ptp(came):
         return {"correlation": 0.0, "slope": 0.0}
     line = linregress(asked, came)
@@ -161,7 +161,7 @@ def _fit(asked: Doubles, came: Doubles) -> Row:
 
 
 def _timings() -> Figures:
-    """Measure a picture with one and with three faces looked for, and from picture to sighting in a child process."""
+    """Measure landmarks of a picture for at most one and three faces, and picture to sighting in a child process."""
     camera = VirtualWebcam()  # a person who nods once a second
     once = [camera.picture(face_of(pitch=0.1 * float(np.sin(2 * np.pi * k / _PICTURE_HZ)))) for k in range(_PICTURE_HZ)]
     pictures = [once[k % _PICTURE_HZ] for k in range(round(_VIDEO_S * _PICTURE_HZ))]

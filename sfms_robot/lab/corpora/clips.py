@@ -1,4 +1,4 @@
-"""One conversation seen from one listener, as arrays; the files of a set of our own; and its splits."""
+"""Dyads: a conversation from the view of one listener, as arrays; their files on disk; and the splits of our data."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ from sfms_robot.signals.tracks import Take
 
 # Facial action units (FACS: Ekman, Friesen and Hager 2002), one intensity for both sides of the face. Shapes without a
 # unit stay 0, and units without a shape of their own are left out; `data check` and `data convert` report both.
-# The 24 columns of `FAUValue` of Seamless Interaction. The data set does not say their order; this is the one that
-# software written for it uses, and `lab.corpora.external.seamless` compares it with the key points of the files.
+# The 24 columns of `FAUValue` of Seamless Interaction. The data set does not document their order; this is the one
+# that software written for it uses, and `lab.corpora.external.seamless` compares it with the key points of the files.
 FAU_VALUE: Final = (1, 2, 4, 5, 6, 7, 9, 10, 12, 13, 14, 15, 16, 17, 18, 20, 22, 23, 24, 25, 26, 28, 30, 43)
-FULL: Final = 2.0  # the intensity at which its columns saturate: shown as 1
-# 23 (lip tightener) and 25 (lips part) have no shape of their own, 30 (jaw sideways) does not tell the side.
+FULL: Final = 2.0  # intensity at which its columns saturate; a blendshape of 1
+# 23 (lip tightener) and 25 (lips part) have no shape of their own, 30 (jaw sideways) does not specify the side.
 WITHOUT_SHAPE: Final = tuple(unit for unit in FAU_VALUE if unit not in SHAPES_OF_UNIT)
 _SHOWN: Final = {shape for unit in FAU_VALUE for shape in SHAPES_OF_UNIT.get(unit, ())}
 WITHOUT_UNIT: Final = tuple(shape for shape in BLENDSHAPES if shape not in _SHOWN)
-# Of seamless27: rotation from the head at rest, axis-angle in FLAME's axes; intensities of action units.
+# Channels of seamless27: rotation from the head at rest, axis-angle in FLAME's axes; intensities of action units.
 SEAMLESS_CHANNELS: Final = (*(f"rotation_{axis}" for axis in "xyz"), *(f"AU{unit}" for unit in FAU_VALUE))
-# Numbers per frame of every space data comes in: those a listener may work in, and two that it may not.
+# Numbers per frame in every motion space of data: spaces that a listener can work in, and two that it cannot.
 WIDTHS: Final[Mapping[str, int]] = {
     **{name: len(channels) for name, channels in SPACE_CHANNELS.items()},
     "deep3d73": 73,  # Deep3DFaceRecon: angle 3 | expression 64 | translation 3 | crop 3
     "seamless27": len(SEAMLESS_CHANNELS),
 }
-# What reading a broken file may raise; numpy parses the headers of its files as Python literals.
+# Errors that reading a broken file may raise; numpy parses the headers of its files as Python literals.
 UNREADABLE: Final = (
     OSError, ValueError, KeyError, IndexError, TypeError, EOFError, NotImplementedError, SyntaxError,
     tokenize.TokenError, pickle.UnpicklingError, zipfile.BadZipFile, zlib.error,
@@ -58,7 +58,7 @@ _EVENT: Final = np.dtype(
     + [("kind", "U16"), ("swings", "i4"), ("target_rad", "f8", 2)]
 )
 _VOICES: Final = ("audio", "agent_audio")
-# Other arrays that a dyad may lack: their type on disk, and as they are read.
+# Other optional arrays of a dyad: their type on disk, and their type once read.
 _OPTIONAL: Final[Mapping[str, tuple[type, type]]] = {
     "states": (np.int8, np.int8),
     "mel": (np.float32, np.float32),
@@ -70,23 +70,23 @@ _Number = TypeVar("_Number", bound=np.generic)
 
 @dataclass(frozen=True, kw_only=True)
 class Dyad:
-    """N frames of a speaker and of the listener who answered. Sound is `audio`, or `mel`, or missing.
+    """N frames of a speaker and of the listener. Sound is `audio`, or `mel`, or missing.
 
     Attributes:
-        name: unique, tells the origin (meeting, listener).
-        audio: (samples_of(N, fps),) speaker's voice, 16 kHz mono, or None: the data ships no waveform.
+        name: unique; contains the origin (meeting, listener).
+        audio: (samples_of(N, fps),) speaker's voice, 16 kHz mono, or None if the data ship no waveform.
         speaker: (N, D) speaker's motion; a row of NaN where the face is not known.
-        listener: (N, D) listener's motion: what is to be learned.
+        listener: (N, D) listener's motion, which is to be learned.
         listening: (N,) True where another person spoke in the last 2 s and the listener is silent.
         space: of both motions, a key of `WIDTHS`.
-        fps: frames a second.
+        fps: frames per second.
         mel: (4N, 128) natural log of the speaker's mel power, for data that ships this in place of a waveform.
-        features: more about each frame by name, (N, F): "hubert", "attributes", ...
-        agent_audio: (samples_of(N, fps),) the listener's own voice, or None: the data ships none.
+        features: further arrays (N, F) about the frames, by name: "hubert", "attributes", ...
+        agent_audio: (samples_of(N, fps),) the listener's own voice, or None if the data ship none.
         states: (N,) int8, the listener's conversational state, -1 where not known; None: not known anywhere.
-        events: what the listener did, as `frames.ListenerEvent`, times from the first frame; None: not annotated.
-        head_of_gaze_rad: (N, 3) roll, pitch, yaw: the part of `listener`'s pose that goes with the gaze, which a
-            listener that draws events leaves to `signals.gaze_kinematics`; None: not known separately.
+        events: events of the listener, as `frames.ListenerEvent`, times from the first frame; None: not annotated.
+        head_of_gaze_rad: (N, 3) roll, pitch, yaw: the part of `listener`'s pose that belongs to the gaze. For a
+            listener with events, `signals.gaze_kinematics` computes it. None: not known separately.
         attention: (N,) 0..1, whether the speaker looks at the listener, NaN where not known; None: not known anywhere.
     """
 
@@ -136,13 +136,13 @@ class Dyad:
 
     @property
     def voice(self) -> Floats | None:
-        """Return the speaker's sound; None for zeros too: they mean a missing microphone, not a silent person."""
+        """Return the speaker's sound; None also for zeros, which mean a missing microphone, not a silent person."""
         return self.audio if self.audio is not None and self.audio.any() else None
 
     def mel_rows(self) -> Floats | None:
         """Return the natural log of mel power (4N, 128): `mel`, or made from `audio`; None without sound.
 
-        At other rates than 25 each row is the newest of the 100 a second that is complete by its time.
+        At frame rates other than 25, each row is the latest of the 100 rows per second that is complete by its time.
         """
         if self.mel is not None or self.audio is None:
             return self.mel
@@ -152,9 +152,9 @@ class Dyad:
 
 
 def at_rate(rows: NDArray[_Number], rate_hz: float, wanted: int, wanted_hz: float) -> NDArray[_Number]:
-    """Resample rows (M, ...) to (wanted, ...): for each time the newest row that is complete by then.
+    """Resample rows (M, ...) to (wanted, ...): for each time the latest row that is complete by then.
 
-    Nothing is complete by the first few times where they come sooner than the first row: that one stands there.
+    Times before the first row is complete get the first row.
     """
     if rate_hz == wanted_hz:
         return rows[:wanted]
@@ -171,7 +171,7 @@ def samples_of(frames: int, fps: float) -> int:
 def save(folder: Path, dyads: Sequence[Dyad]) -> None:
     """Write one NAME.npz per dyad: audio as int16, arkit58 motion as float16 (3 decimals are more than a servo shows).
 
-    Motion in other spaces stays float32: angles near pi would lose what a nod is made of.
+    Motion in other spaces stays float32: as float16, angles near pi would be too coarse for a nod.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for dyad in dyads:
@@ -190,7 +190,7 @@ def save(folder: Path, dyads: Sequence[Dyad]) -> None:
         if dyad.events is not None:
             none = (np.nan, np.nan)
             rows = [(e.start_s, e.duration_s, e.size, e.kind, e.swings, e.target_rad or none) for e in dyad.events]
-            arrays["events"] = np.array(rows, _EVENT)  # the draws behind them are left out
+            arrays["events"] = np.array(rows, _EVENT)  # without the random draws that decided them
         if (dyad.space, dyad.fps) != ("arkit58", FRAME_HZ):
             arrays |= {"space": np.array(dyad.space), "fps": np.array(dyad.fps)}
         arrays |= {FEATURE + name: rows for name, rows in dyad.features.items()}
@@ -256,10 +256,10 @@ def read_takes(file: Path) -> dict[str, list[Take]]:
 
 # --- Splits: one table for composing, fitting and scoring -----------------------------------------------------------
 #
-# Meetings of a series share their people, so whole series are kept apart; so are whole recordings of voices and faces.
-# The series are laid out by hand so that every part has people whose gaze was annotated, and meetings in which nods
-# were left without a form. Voices of one person, or of people who talk in several recordings together, are in one
-# part. Nothing is fitted, chosen or calibrated on test.
+# Meetings of a series share their people, so a whole series is in one split, and so is a whole recording of a voice or
+# a face. The series were assigned by hand so that every split has people whose gaze was annotated, and meetings in
+# which the form of nods was left blank. Voices of one person, or of people who talk in several recordings together, are
+# in one split. Nothing is fitted, chosen or calibrated on test.
 
 Split = Literal["train", "validation", "test"]
 SPLITS: Final[tuple[Split, ...]] = ("train", "validation", "test")
@@ -269,7 +269,7 @@ SERIES: Final[Mapping[Split, tuple[str, ...]]] = {
     "validation": ("IS1000", "IS1005", "TS3011"),
     "test": ("ES2003", "IS1001", "IS1006"),
 }
-# Recordings of voices, by how their names begin; others are for training.
+# Recordings of voices, by the beginnings of their names; others are for training.
 VOICES: Final[Mapping[Split, tuple[str, ...]]] = {
     "train": (
         "1114_2_01", "jfk", "audio_EN2001", "audio_EN2003", "audio_EN2004", "hvb_01cefd", "hvb_02e416", "hvb_03a17c",
@@ -297,7 +297,7 @@ def split_of_voice(name: str) -> Split:
 
 
 def by_split(items: Iterable[tuple[Split, _Item]]) -> dict[Split, list[_Item]]:
-    """Return items in their order, by split; every split is there."""
+    """Return items in their order, by split; every split is a key."""
     parts: dict[Split, list[_Item]] = {split: [] for split in SPLITS}
     for split, item in items:
         parts[split].append(item)

@@ -1,10 +1,10 @@
-"""Data sets too big for memory: clips known by name and length, read one at a time, and a list of problems.
+"""Data sets too big for memory: clips listed by name and length, read one at a time, and a list of problems.
 
-Every layout of files on disk is one `Layout`. Its `scan` looks at names and headers only. Clips that cannot be used are
-left out by name, as a `Problem`, never silently.
+Every layout of files on disk is one `Layout`. Its `scan` reads names and headers only, where the format allows it. A
+clip that cannot be used is left out and listed by name as a `Problem`, never silently.
 
-Arrays come from files of other projects: headers first, and never code. A pickle can run code. Those of data sets hold
-arrays and plain values, and only these are accepted.
+Arrays come from files of other projects: headers are read first, and code is never run. A pickle can run code. Those of
+data sets hold arrays and plain values, and only these are accepted.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ Kind = Literal[
 ]  # fmt: skip
 
 OUR_NAMES: Final = {"val": "validation", "valid": "validation", "dev": "validation"}  # of splits, by other names
-WITH_VAL: Final = {"train": "train", "validation": "val", "test": "test"}  # REACT, lm-listener
-_NAMED: Final = 5  # problems a warning names
+WITH_VAL: Final = {"train": "train", "validation": "val", "test": "test"}  # names in REACT and lm-listener, by ours
+_NAMED: Final = 5  # most problems that a warning lists
 
 log = logging.getLogger(__name__)
 
@@ -73,10 +73,10 @@ class Clip:
     """One listener's clip: its name, frames, and how to read it.
 
     Attributes:
-        read: Returns the dyad without features; raises ClipError or what `UNREADABLE` names.
-        features: Readers of the other arrays that the layout ships about the frames, (N, F).
-        row: Place in the layout's own list, before anything was left out (REACT's appropriateness matrix counts in
-            it). Set by `formats.scan_split`.
+        read: Returns the dyad without features; raises ClipError or one of `UNREADABLE`.
+        features: Readers of the other arrays (N, F) about the frames that the layout ships.
+        row: Place in the layout's own list, before clips are left out (the row in REACT's appropriateness matrix).
+            Set by `formats.scan_split`.
     """
 
     name: str
@@ -88,13 +88,13 @@ class Clip:
 
 @dataclass(frozen=True, kw_only=True)
 class Dataset(Sequence[Dyad]):
-    """Dyads of one split, read when asked for.
+    """Dyads of one split, each read when it is accessed.
 
     Attributes:
-        features: Names of the shipped features each dyad carries.
+        features: Names of the shipped features that each dyad has.
         problems: Clips and files that were left out, and why.
-        notes: Lines for a person.
-        licence: The licence that the data state; None: they state none.
+        notes: Lines of text for the user.
+        licence: The licence stated by the data; None if they state none.
     """
 
     layout: str
@@ -113,7 +113,7 @@ class Dataset(Sequence[Dyad]):
 
     @property
     def lengths(self) -> tuple[int, ...]:
-        """Frames of each clip."""
+        """Return the number of frames of each clip."""
         return tuple(clip.frames for clip in self.clips)
 
     @property
@@ -152,7 +152,7 @@ class Dataset(Sequence[Dyad]):
 
 
 def usable(dyads: Sequence[Dyad]) -> Iterator[Dyad]:
-    """Yield every dyad that can be read; the others are counted and named in one warning at the end."""
+    """Yield every dyad that can be read; the others are counted and listed in one warning at the end."""
     left_out = []
     for index in tracked(range(len(dyads)), "reading dyads"):
         try:
@@ -167,7 +167,7 @@ def usable(dyads: Sequence[Dyad]) -> Iterator[Dyad]:
 
 
 def guarded(where: Path | str, read: Callable[[], _T]) -> _T:
-    """Return what `read` returns; an error that a broken file causes becomes a ClipError."""
+    """Return the result of `read`; an error caused by a broken file becomes a ClipError."""
     try:
         return read()
     except ClipError:
@@ -176,7 +176,7 @@ def guarded(where: Path | str, read: Callable[[], _T]) -> _T:
         raise ClipError("unreadable", where, error) from error
 
 
-Found = Clip | Problem | str  # str: a note for a person
+Found = Clip | Problem | str  # str: a note for the user
 
 
 def attempt(items: Iterable[_T], build: Callable[[_T], Clip]) -> Iterator[Found]:
@@ -193,13 +193,13 @@ class Layout:
     """Layout of one family of data sets on disk.
 
     Attributes:
-        space, fps: Of the motion.
-        splits: Names of the splits in a folder, by ours (train, validation, test, ...); empty: another layout.
+        space, fps: Motion space and frame rate of the motion.
+        splits: Names of the splits in a folder, by ours (train, validation, test, ...); empty for another layout.
         scan: (root, their name of a split) -> clips, problems and notes. Reads headers only where the format allows
             it.
         below: Folders in which the data may lie, relative to the given one.
-        order: Order of the channels in the files as they are shipped; None: there is only one.
-        held_out: Share of train that serves as validation where the layout ships none.
+        order: Order of the channels in the files as they are shipped; None if there is only one.
+        held_out: Share of train that serves as validation if the layout ships none.
         facts: (root, their name of a split) -> space, fps or licence where these differ from folder to folder.
     """
 
@@ -216,16 +216,16 @@ class Layout:
     facts: Callable[[Path, str], Mapping[str, Any]] = lambda place, split: {}
 
     def root(self, folder: Path) -> Path | None:
-        """Return the folder in or under the given one in which the data lie; None: another layout."""
+        """Return the folder that holds the data, the given one or one below it; None for another layout."""
         return next((place for name in self.below if self.splits(place := folder / name)), None)
 
 
 # --- Arrays from files of other projects ------------------------------------------------------------------------------
 
-SOUND_SLACK_S: Final = 0.2  # sound may end this much before the face: containers round
+SOUND_SLACK_S: Final = 0.2  # sound may end this much before the face, since containers round
 FRAMES_SLACK: Final = 2  # two tracks of one clip may differ by this
 
-# What numpy's arrays are rebuilt from, by the names of numpy 1 and 2; nothing here runs anything else.
+# Names, in numpy 1 and 2, from which a pickle rebuilds arrays; none of these runs other code.
 _ARRAY_PARTS: Final = {
     (module, name)
     for part in ("numpy.core", "numpy._core")
@@ -253,7 +253,7 @@ def _module(name: str) -> Any:
 
 
 def unpickle(file: Path) -> Any:
-    """Return arrays and plain values of a pickle. Raises UnpicklingError for one that asks for more, or is broken."""
+    """Return arrays and plain values of a pickle. Raises UnpicklingError for one that needs more, or is broken."""
     content = io.BytesIO(file.read_bytes())
     try:
         return _ArraysOnly(content).load()
@@ -262,7 +262,7 @@ def unpickle(file: Path) -> Any:
 
 
 def torch_load(file: Path) -> Any:
-    """Return what torch saved: tensors, arrays and plain values, as `weights_only` allows.
+    """Load a file saved by torch: tensors, arrays and plain values, as `weights_only` allows.
 
     Raises ClipError for a file that needs more.
     """
@@ -272,7 +272,7 @@ def torch_load(file: Path) -> Any:
     arrays += [type(np.dtype(kind)) for kind in ("f2", "f4", "f8", "i2", "i4", "i8", "u1", "?", "U1", "S1")]
     try:
         with torch.serialization.safe_globals(arrays), warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # scrambled bytes look like a protocol of the future
+            warnings.simplefilter("ignore", UserWarning)  # broken bytes can look like a later pickle protocol
             return torch.load(file, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:
         detail = "holds more than tensors, arrays and plain values; save it again with these alone"
@@ -282,7 +282,7 @@ def torch_load(file: Path) -> Any:
 
 
 def existing(file: Path, kind: Kind = "missing half") -> Path:
-    """Return a file that is there. Raises ClipError, of this kind."""
+    """Return the file if it exists. Raises ClipError of this kind."""
     if not file.is_file():
         raise ClipError(kind, file, "no such file")
     return file
@@ -292,7 +292,7 @@ def npy(file: Path) -> NDArray[Any]:
     """Map an array on disk into memory. Raises ClipError."""
     out: NDArray[Any] = guarded(file, lambda: np.load(existing(file), mmap_mode="r", allow_pickle=False))
     if not isinstance(out, np.ndarray):
-        out.close()  # an archive of several
+        out.close()  # an archive of several arrays
         raise ClipError("unreadable", file, "no array")
     if out.dtype.kind not in "fiu":
         raise ClipError("wrong dims", file, f"holds {out.dtype}, no numbers")
@@ -319,7 +319,7 @@ def columns(file: Path) -> dict[str, list[str]]:
 
 
 def npz(file: Path, *keys: str) -> list[NDArray[Any]]:
-    """Return arrays of a .npz. Raises what `UNREADABLE` names."""
+    """Return arrays of a .npz. Raises one of `UNREADABLE`."""
     with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
         return [arrays[key] for key in keys]
 
@@ -344,7 +344,7 @@ def npz_shapes(file: Path) -> dict[str, tuple[int, ...]]:
 
 
 def frames_of(name: str, *tracks: tuple[int, ...], slack: int = FRAMES_SLACK) -> int:
-    """Return the frames that tracks of these shapes share; singleton axes do not count. Raises ClipError."""
+    """Return the number of frames shared by tracks of these shapes, without singleton axes. Raises ClipError."""
     lengths = [next((size for size in shape[:-1] if size != 1), 1) for shape in tracks]
     if max(lengths) - min(lengths) > slack:
         raise ClipError("lengths differ", name, f"{max(lengths)} frames beside {min(lengths)}")
@@ -352,7 +352,7 @@ def frames_of(name: str, *tracks: tuple[int, ...], slack: int = FRAMES_SLACK) ->
 
 
 def track(name: str, values: NDArray[Any], frames: int, width: int, *, gaps: bool = False) -> Floats:
-    """Return the first frames of a track (T, >= width) or with singleton axes, as (frames, width) float32.
+    """Return the first frames of a track (T, width), perhaps with singleton axes, as (frames, width) float32.
 
     Raises ClipError for other shapes, and for values that are not finite unless `gaps` are allowed.
     """
@@ -393,14 +393,14 @@ def dyad_of(
     mel: Floats | None = None,
     own: bool = False,
 ) -> Dyad:
-    """Return a dyad of a data set without annotations: the two voices, where both are there, say who listens when.
+    """Return a dyad of a data set without annotations; its listening time is derived from the two voices.
 
-    Without the listener's voice the listener listens all the time, as the role in the data says.
+    If either voice is missing, the listener listens all the time, which is its role in the data.
 
     Args:
         faces: Origin and rows (T, D) of the speaker, which may have gaps, and of the listener.
         voices: Files of the speaker's and the listener's voice; the second may be missing.
-        own: Let the dyad carry the listener's voice.
+        own: Store the listener's voice in the dyad.
     """
     speaker, listener = (
         track(str(origin), rows, frames, WIDTHS[space], gaps=gaps)
@@ -424,7 +424,7 @@ def speaks(voice: Floats, frames: int, fps: float) -> NDArray[np.bool_]:
 
 
 def numbers(values: Mapping[str, Any], key: str) -> NDArray[Any]:
-    """Return an array or tensor of a dict. Raises KeyError, or TypeError for anything else."""
+    """Return an array or tensor of numbers in a dict. Raises KeyError, or TypeError for anything else."""
     found = values[key]
     array = np.asarray(found.numpy() if hasattr(found, "numpy") else found)
     if array.dtype.kind not in "fiu":

@@ -1,17 +1,17 @@
-"""Which of the seven conversational states (3.3) the agent is in, from who speaks, what is feedback, and nods.
+"""The agent's conversational state, one of seven (3.3), from voice activity, feedback and nods.
 
-The paper annotated its data by hand and shows the result in a figure alone; this rule is ours. Voice activity decides
-what is possible; dialogue acts decide the rest:
+The paper annotated its data by hand and shows the result only in a figure; this rule is ours. Voice activity limits the
+possible states; dialogue acts decide among them:
 
 | agent | user | state |
 |---|---|---|
 | speaks | silent | speaking; giving feedback when it is an "mm-hm" into the other's pause |
-| speaks | speaks | giving feedback when the agent's words are; receiving it when the user's are; else interrupted |
-| silent | speaks | receiving feedback in the agent's turn; giving it while he nods; else listening |
+| speaks | speaks | giving feedback if the agent's words are feedback, receiving if the user's are; else interrupted |
+| silent | speaks | receiving feedback in the agent's turn; giving it while the agent nods; else listening |
 | silent | silent | thinking when the agent spoke last and speaks next; else waiting |
 
-Feedback does not take the floor: who spoke last or speaks next leaves it out. Where no dialogue acts are at hand,
-`short_answers` stands in for them.
+Feedback does not take the floor: it is ignored when the last or next person to speak is determined. If there are no
+dialogue acts, `short_answers` replaces them.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ from sfms_robot.signals.events import runs
 
 STATE: Final[Mapping[str, int]] = {name: index for index, name in enumerate(STATES)}
 UNKNOWN: Final = -1
-ANSWER_S: Final = 1.0  # shorter utterances in the other's turn are feedback, where nobody annotated it
+ANSWER_S: Final = 1.0  # if feedback was not annotated, shorter utterances in the other's turn count as it
 
 
 def states_of_activity(agent: Bools, user: Bools) -> NDArray[np.int8]:
-    """Return one state per frame (N,) from voice activity alone: short answers are feedback, and no nods are known."""
+    """Return one state per frame (N,) from voice activity alone: short answers are feedback, nods are unknown."""
     return states_of(agent, user, short_answers(agent, user), short_answers(user, agent), np.zeros_like(agent))
 
 
 def states_of(agent: Bools, user: Bools, agent_feedback: Bools, user_feedback: Bools, nods: Bools) -> NDArray[np.int8]:
     """Return one state per frame (N,); see the table of this module.
 
-    Per frame (N,): who speaks, which of it is feedback (may reach beyond the speech), and whether the agent nods.
+    The masks (N,) are: speech of each person, feedback of each (may reach beyond the speech), and nods of the agent.
     """
     told, answered = agent & agent_feedback, user & user_feedback
     floor = np.where(agent & ~told, 1, np.where(user & ~answered, -1, 0))
-    own_turn = (_latest(floor) == 1) & (_latest(floor[::-1])[::-1] == 1)  # the agent had the floor, and has it next
-    rules = (  # the first that holds
+    own_turn = (_latest(floor) == 1) & (_latest(floor[::-1])[::-1] == 1)  # the agent had the floor last and has it next
+    rules = (  # the first rule that applies decides
         (told, "giving_feedback"),
         (agent & answered, "receiving_feedback"),
         (agent & user, "interrupted"),
@@ -64,7 +64,7 @@ def _latest(floor: NDArray[np.int_]) -> NDArray[np.int_]:
 
 
 def short_answers(active: Bools, other: Bools) -> Bools:
-    """Return utterances (N,) under a second that begin in the other's speech before the other continues."""
+    """Return a mask (N,) of utterances under 1 s with speech of the other up to 0.5 s before and up to 1 s after."""
     out = np.zeros(len(active), bool)
     for start, end in runs(active):
         before, after = other[max(0, start - FRAME_HZ // 2) : start + 1], other[end : end + FRAME_HZ]

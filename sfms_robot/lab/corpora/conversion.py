@@ -1,6 +1,6 @@
-"""Dyads of every space that can become ours, at 25 fps in `arkit58`, and what of the data is lost on the way.
+"""Conversion of dyads from other motion spaces to `arkit58` at 25 fps, and a measure of the loss.
 
-Nothing is invented: a channel without a source stays at rest. What is lost is measured on the data themselves.
+Nothing is invented: a channel without a source stays at rest. The loss is measured on the data themselves.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from sfms_robot.signals.rotations import angle_between
 from sfms_robot.signals.tracks import Track, resample
 
 CONVERTIBLE: Final = ("arkit58", "deca56", "faceverse58", "seamless27")
-_ANGLES: Final = slice(0, 3)  # of a pose: roll, pitch, yaw
-_UNITS: Final = slice(3, 3 + len(FAU_VALUE))  # of seamless27
+_ANGLES: Final = slice(0, 3)  # roll, pitch, yaw of a pose
+_UNITS: Final = slice(3, 3 + len(FAU_VALUE))  # action units of seamless27
 _UNSHOWN: Final = [FAU_VALUE.index(unit) for unit in WITHOUT_SHAPE]
 
 
-FIGURES: Final = {  # of `Residual.told`: what each means
+FIGURES: Final = {  # meaning of each figure of `Residual.told`
     "pose_round_trip_deg": "head turned back into the source's terms: largest difference, degrees",
     "resampling_rms_deg": "head angles at 25 fps read back at the source's rate: rms difference, degrees",
     "expression_lost_share": "rms of the expression that blendshapes do not show, of the whole",
@@ -38,15 +38,16 @@ FIGURES: Final = {  # of `Residual.told`: what each means
 
 @dataclass(kw_only=True)
 class Residual:
-    """Loss by conversion over all clips so far, of listeners' motion, frame by frame.
+    """Loss of the listeners' motion by conversion, over the frames of all clips so far.
 
     Attributes:
-        pose_rad: largest angle between a head as filed and as read back from ours in the source's own terms.
-        resampled_rad2, resampled: squares of the angles' differences, and their count, between the motion as filed and
-            our 25 fps read back at the source's instants.
-        expression2, left2: squares of the source's expression, and of the part that our blendshapes do not give back.
-        beyond, values: how many values lay outside 0..1 and were cut, of how many.
-        stored_rad, stored: largest differences between what was converted and what was written.
+        pose_rad: largest angle between the head in the source and ours converted back to the source's representation.
+        resampled_rad2, resampled: sum of the squared angle differences, and their count, between our motion at the
+            source's rate and the same at 25 fps, interpolated at the times of the source's frames.
+        expression2, left2: sums of squares of the source's expression and of the part that our blendshapes lose.
+        beyond, values: number of values that were cut because they lay outside 0..1 (seamless27: above `FULL`), and
+            number of all values.
+        stored_rad, stored: largest differences between the converted and the written motion: head angles, blendshapes.
     """
 
     pose_rad: float = 0.0
@@ -61,7 +62,7 @@ class Residual:
     notes: dict[str, None] = field(default_factory=dict)
 
     def told(self) -> dict[str, Any]:
-        """Return figures by name, None for those that do not apply; degrees and shares."""
+        """Return the figures by name, in degrees and shares; None for those that do not apply."""
         figures = (
             math.degrees(self.pose_rad),
             math.degrees(math.sqrt(self.resampled_rad2 / self.resampled)) if self.resampled else None,
@@ -73,7 +74,7 @@ class Residual:
         return dict(zip(FIGURES, figures, strict=True))
 
     def written(self, converted: Dyad, read_back: Dyad) -> None:
-        """Take in what the file holds of a converted dyad."""
+        """Update the largest differences with a converted dyad and the same dyad read back from its file."""
         apart = np.abs(converted.listener - read_back.listener)
         self.stored_rad = max(self.stored_rad, float(apart[:, POSE][:, _ANGLES].max()))
         self.stored = max(self.stored, float(apart[:, SHAPES].max()))
@@ -82,14 +83,14 @@ class Residual:
 def to_ours(dyad: Dyad, residual: Residual, flame: FlameMatrix | None = None) -> Dyad:
     """Return the dyad in `arkit58` at 25 fps, and add the loss to `residual`; a speaker's unknown frames stay unknown.
 
-    Raises ConfigError for a space that cannot become ours, and for a clip of less than one frame.
+    Raises ConfigError for a space that cannot be converted to ours, and for a clip shorter than one frame.
     """
     if dyad.space not in CONVERTIBLE:
         raise ConfigError(f"{dyad.name}: {dyad.space} cannot become arkit58 ({', '.join(CONVERTIBLE)})")
     ours = in_arkit(dyad, flame)
     _lost(dyad, ours.listener, residual, flame)
     slower = at_frame_rate(ours)
-    if slower is not ours:  # our angles at the instants of the source's frames; a frame stands for its end
+    if slower is not ours:  # compare at the times of the source's frames; the time of a frame is its end
         theirs_s, ours_s = ((np.arange(len(each.listener)) + 1) / each.fps for each in (ours, slower))
         inside = (theirs_s >= ours_s[0]) & (theirs_s <= ours_s[-1])
         for column in range(_ANGLES.stop):
@@ -106,7 +107,7 @@ def in_arkit(dyad: Dyad, flame: FlameMatrix | None = None) -> Dyad:
 
 
 def in_ours(motion: Floats, space: str, flame: FlameMatrix | None = None) -> Floats:
-    """Return motion (N, D) of a convertible space as (N, 58) arkit58; rows that are not known stay so."""
+    """Return motion (N, D) of a convertible space as (N, 58) arkit58; unknown rows (NaN) stay unknown."""
     known = np.isfinite(motion).all(axis=1)
     out = np.full((len(motion), 58), np.nan, np.float32)
     if space == "arkit58":
@@ -127,7 +128,7 @@ def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | Non
         return
     filed, seamless = dyad.listener.astype(np.float64), dyad.space == "seamless27"
     name, turned = ("deca56", _ANGLES) if seamless else (dyad.space, SPACES[dyad.space].rotation)
-    known = SPACES[name]  # heads as filed, and ours expressed in the source's terms again
+    known = SPACES[name]  # compare the head of the source with ours converted back
     back = MotionSpace(name, rest_of(name)).encode(ours)[:, known.rotation].astype(np.float64)
     apart_rad = angle_between(known.matrices(filed[:, turned]), known.matrices(back))
     residual.pose_rad = max(residual.pose_rad, float(apart_rad.max(initial=0.0)))
@@ -150,17 +151,17 @@ def _lost(dyad: Dyad, ours: Floats, residual: Residual, flame: FlameMatrix | Non
     residual.left2 += float(np.square(lost).sum())
 
 
-# --- Dyads of other frame rates at 25 fps: what a listener that is streamed through them asks for -----------------
+# --- Dyads of other frame rates resampled to 25 fps, the rate at which a listener is streamed ---------------------
 
 
 def at_frame_rate(dyad: Dyad) -> Dyad:
-    """Return the dyad at 25 fps, cut to whole frames: motion linear in time, other rows the newest known.
+    """Return the dyad at 25 fps, cut to whole frames: motion linear in time, other rows the latest complete ones.
 
-    Raises ConfigError for other rates in spaces other than arkit58, and for less than one frame.
+    Raises ConfigError for another rate in a space other than arkit58, and for a dyad shorter than one frame.
     """
     if dyad.fps == FRAME_HZ:
         return dyad
-    if dyad.space != "arkit58":  # in others what lies between two frames is not between their numbers
+    if dyad.space != "arkit58":  # in other spaces, interpolating the numbers does not interpolate the motion
         raise ConfigError(f"{dyad.name}: {dyad.fps:g} fps in {dyad.space}, a listener is streamed at {FRAME_HZ}")
     frames = int(len(dyad.listener) * FRAME_HZ / dyad.fps + 1e-6)
     if not frames:
@@ -187,7 +188,7 @@ def at_frame_rate(dyad: Dyad) -> Dyad:
 
 
 def _motion(motion: Floats, fps: float, frames: int) -> Floats:
-    """Resample (N, 58) to (frames, 58). A frame stands for its end, (i + 1) / rate; the first also before."""
+    """Resample (N, 58) to (frames, 58). The time of frame i is its end, (i + 1) / rate; the first also holds before."""
     ends_s = (np.arange(len(motion)) + 1) / fps
     found = resample(Track(ends_s, motion, frozenset(CHANNELS)), FRAME_HZ, FRAME_S).motion[:frames]
     found[(np.arange(frames) + 1) * FRAME_S < ends_s[0] - 1e-6] = motion[0]

@@ -1,6 +1,6 @@
-"""Behind `data`: dyads composed, and what a data set on disk holds and what is wrong with it.
+"""Functions behind `data`: compose dyads, check the content of a data set on disk, convert it to our layout.
 
-Of a checked set every clip is read once, and nothing is skipped in silence.
+A check reads every clip of the set once and reports everything that it skips.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from sfms_robot.listeners.space import FlameMatrix, read_matrix
 
 
 def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: bool, jobs: int) -> Figures:
-    """Compose into out/train, out/validation and out/test. Returns the minutes written per split."""
+    """Compose dyads into out/train, out/validation and out/test. Returns the minutes written per split."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out}: is a file, not a folder to write dyads to")
     with bar("composing dyads") as moved:
@@ -39,16 +39,16 @@ def compose_dyads(data: Path, out: Path, minutes: float, seed: int, overwrite: b
 
 
 def check_data(folder: Path, layout: str = "auto", order: Order | None = None, window: int = 0) -> Figures:
-    """Read every split of a folder.
+    """Read every split of the data set in a folder.
 
     Args:
-        window: Frames that a clip must have.
+        window: Least number of frames of a clip.
 
     Returns:
         layout, order, licence, and per split: clips, minutes, fps, space, frames, sound, features, channels, problems
         (kind, count, names, first detail), notes. `usable` is False when no clip can be used, or the order is swapped.
 
-    Raises ConfigError where there is no data set at all.
+    Raises ConfigError if the folder holds no data set.
     """
     found, place = formats.detect(folder, layout)
     splits = [_checked(found, place, name, order, window) for name in formats.split_names(found, place)]
@@ -125,8 +125,8 @@ class _Tally:
 
     Attributes:
         listening, faceless: Frames in which the listener listens, and in which the speaker's face is not known.
-        sound: Clips by the form of their sound.
-        features: Clips that have each shipped feature.
+        sound: Number of clips by the form of their sound.
+        features: Number of clips that have each shipped feature.
     """
 
     def __init__(self) -> None:
@@ -134,7 +134,7 @@ class _Tally:
         self.sound: Counter[str] = Counter()
         self.features: Counter[str] = Counter()
         self._missing: dict[str, list[Problem]] = {}
-        self._motion: list[Doubles] = []  # of each clip, (4, D): lowest, highest, sum, sum of squares
+        self._motion: list[Doubles] = []  # (4, D) per clip: least, greatest, sum, sum of squares
 
     def add(self, dyad: Dyad, clip: Clip) -> None:
         """Count a clip, and read each of its shipped features."""
@@ -154,7 +154,7 @@ class _Tally:
                 self._missing.setdefault(name, []).append(error.problem)
 
     def missing(self) -> Iterator[Problem]:
-        """Yield problems of features. One that no clip has is not shipped: a count of 0, and no problem."""
+        """Yield the problems of features. A feature missing from all clips is not shipped, which is not a problem."""
         for name, found in self._missing.items():
             yield from (one for one in found if self.features[name] or one.kind != "missing feature")
 
@@ -172,7 +172,7 @@ class _Tally:
         return [dict(zip(keys, row, strict=True)) for row in zip(titles, *figures, strict=True)]
 
 
-# --- Behind `data convert`: a data set as its authors lay it out in, dyads as `train` and `evaluate` read them out
+# --- `data convert`: from the layout of a data set's authors to dyads for `train` and `evaluate` -----------------
 
 
 def convert_data(
@@ -183,17 +183,17 @@ def convert_data(
     flame_matrix: Path | None = None,
     flame_order: str = "alphabetical",
 ) -> Figures:
-    """Write every split of `folder` as out/SPLIT/NAME.npz in `arkit58` at 25 fps, and out/source.yaml with their
-    licence.
+    """Write every split of `folder` as out/SPLIT/NAME.npz in `arkit58` at 25 fps, and their licence.
 
-    One clip is held in memory at a time. Clips that cannot be used are left out and counted.
+    The licence goes to out/source.yaml. One clip is held in memory at a time. Clips that cannot be used are left out
+    and counted.
 
     Returns:
         folder, out, layout, licence, per split: clips, minutes, left_out (by kind, with the first), notes; `residual`:
-        figures of `Residual.told`, measured on the listeners' motion; notes: parts that our space cannot show.
+        figures of `Residual.told`, measured on the listeners' motion; notes: parts that our space cannot represent.
 
-        Raises ConfigError for a folder without a data set, a space that cannot become ours, an `out` that is not empty,
-        an invalid matrix, and where no clip can be used.
+        Raises ConfigError for a folder without a data set, a space that cannot be converted to ours, an `out` that is
+        not empty, an invalid matrix, and a data set without a usable clip.
     """
     found, place = formats.detect(folder, layout)
     if found.space not in CONVERTIBLE:
@@ -237,7 +237,7 @@ def convert_data(
 
 
 def _converted(dataset: Dataset, out: Path, residual: Residual, flame: FlameMatrix | None) -> Figures:
-    """Convert every clip of a split, write it, and compare the motion that is read back; return the split's report."""
+    """Convert and write every clip of a split, and compare it with the file read back; return the split's report."""
     problems, seconds, written = list(dataset.problems), 0.0, 0
     for index in tracked(range(len(dataset)), dataset.split):
         try:

@@ -1,7 +1,7 @@
-"""One door to every data set: which layout a folder has, which splits, and the dyads of one of them.
+"""Access to data sets of every layout: detect the layout and the splits of a folder, and open one split.
 
 Some projects write the six pose channels first and some last, under the same file names. The order is an argument, by
-default the layout's own; files that look like the other one are refused before anything is learned from them.
+default the layout's own; files that look like the other order are refused before anything is learned from them.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from sfms_robot.lab.corpora.external import dualtalk, l2l, react, seamless, vico
 
 # --- Dyads as `clips.save` keeps them: `{train,validation,test}/NAME.npz`, from `data compose` and `data convert` -----
 
-SOURCE: Final = "source.yaml"  # beside the splits of converted data: their layout and licence
+SOURCE: Final = "source.yaml"  # in the folder of converted data: their layout and licence
 
 
 def _stored_splits(place: Path) -> Mapping[str, str]:
@@ -55,7 +55,7 @@ def _stored_splits(place: Path) -> Mapping[str, str]:
 
 
 def _stored_kind(file: Path) -> tuple[str, float]:
-    """Return space and frame rate of one dyad. Raises ClipError for another file."""
+    """Return space and frame rate of one dyad. Raises ClipError for a file that is not a dyad."""
     shapes = npz_shapes(file)
     if "listening" not in shapes:
         raise ClipError("unreadable", file, "not a dyad: has no listening")
@@ -66,14 +66,14 @@ def _stored_kind(file: Path) -> tuple[str, float]:
 def _stored_facts(place: Path, split: str) -> Mapping[str, Any]:
     """Return space and rate of the first dyad, and the licence of converted data.
 
-    `place` may be one split of them. Raises ConfigError for an invalid source.yaml.
+    `place` may also be the folder of one split. Raises ConfigError for an invalid source.yaml.
     """
     facts: dict[str, Any] = {}
     for file in sorted((place / split).glob("*.npz")):
         try:
             facts["space"], facts["fps"] = _stored_kind(file)
             break
-        except ClipError:  # named by the scan
+        except ClipError:  # listed by the scan
             continue
     source = next((base / SOURCE for base in (place, place.parent) if (base / SOURCE).is_file()), None)
     if source is not None:
@@ -118,7 +118,7 @@ LAYOUTS: Final = {
         dualtalk.ARKIT_LAYOUT, dualtalk.LAYOUT, vico.DIM, vico.VICO, seamless.LAYOUT, COMPOSED,
     )
 }  # fmt: skip
-_SAMPLE: Final = 8  # clips looked at for the order of their channels
+_SAMPLE: Final = 8  # number of clips checked for the order of their channels
 _SEED: Final = 0
 
 log = logging.getLogger(__name__)
@@ -132,7 +132,7 @@ def detect(folder: Path, layout: str = "auto") -> tuple[Layout, Path]:
         problem = "expected a folder, got a file (unpack an archive first)" if folder.exists() else "no such folder"
         raise ConfigError(f"{folder}: {problem}")
     tried = list(LAYOUTS.values()) if layout == "auto" else [LAYOUTS[layout]]
-    # Our own first: converted dyads keep the names of their files, and these may be another layout's.
+    # Our own layout first: converted dyads keep the names of their files, which may fit another layout.
     for candidate in sorted(tried, key=lambda one: one is not COMPOSED):
         place = candidate.root(folder)
         if place is not None:
@@ -142,7 +142,7 @@ def detect(folder: Path, layout: str = "auto") -> tuple[Layout, Path]:
 
 
 def split_names(layout: Layout, place: Path) -> tuple[str, ...]:
-    """Return the splits that `open_dataset` can give, by our names."""
+    """Return our names of the splits that `open_dataset` can open."""
     found = set(layout.splits(place))
     if "train" in found and layout.held_out:
         found.add("validation")
@@ -156,17 +156,17 @@ def open_dataset(
     order: Order | None = None,
     features: Iterable[str] = (),
 ) -> Dataset:
-    """Open one split of a data set on disk; its dyads are read one at a time when asked for.
+    """Open one split of a data set on disk; its dyads are read one at a time when they are accessed.
 
     Args:
-        split: train, validation (val, valid, dev), test or what else the layout has. Where it ships no validation, a
-            share of train is held out, the same every time.
+        split: train, validation (val, valid, dev), test or another split of the layout. If the layout ships no
+            validation, a share of train is held out, the same every time.
         layout: a key of `LAYOUTS`, or "auto".
-        order: of the channels in the files, by default the layout's; refused unless it is said and they look
-            like the other.
-        features: names of shipped features each dyad is to carry.
+        order: of the channels in the files, by default the layout's. Files that look like the other order are refused
+            unless the order is given here.
+        features: names of shipped features that each dyad will have.
 
-    What cannot be used is in `problems` and counted in a warning. Raises ConfigError when nothing is left.
+    Clips that cannot be used are in `problems` and counted in a warning. Raises ConfigError when no clip is left.
     """
     found, place = detect(folder, layout)
     dataset = scan_split(found, place, OUR_NAMES.get(split, split), order)
@@ -182,15 +182,16 @@ def open_dataset(
         log.warning(
             "%s %s: %d clips, %.1f min; left out: %s", found.name, dataset.split, len(dataset), dataset.minutes, said
         )
-    if dataset.licence is not None and dataset.split == "train":  # what weights come from
+    if dataset.licence is not None and dataset.split == "train":  # the split that weights are trained on
         log.warning("%s: %s", place, dataset.licence)
     return dataset
 
 
 def open_for(space: str, folder: Path, split: str, order: Order | None = None, features: Iterable[str] = ()) -> Dataset:
-    """Open a data set for a listener that works in `space`: in that space, or in arkit58, which becomes any.
+    """Open a data set for a listener that works in `space`, in that space or in arkit58, which converts to any space.
 
-    Every dyad carries those of `features` that its data ship; what they do not is made from the sound.
+    A set in faceverse58 is converted to arkit58. Every dyad has those of `features` that the data ship; the others are
+    computed from the sound.
     """
     dataset = open_dataset(folder, split, order=order)
     dataset = replace(dataset, features=tuple(name for name in features if name in dataset.clips[0].features))
@@ -212,7 +213,7 @@ def scan_split(layout: Layout, place: Path, split: str, order: Order | None = No
     if split not in split_names(layout, place):
         raise ConfigError(f"{place}: has no split {split} ({', '.join(split_names(layout, place)) or 'none'})")
     name = theirs.get(split, theirs.get("train", ""))
-    with bar(f"{split}: headers"):  # of many files even these take some time
+    with bar(f"{split}: headers"):  # reading those of many files takes some time
         found = list(layout.scan(place, name))
         facts = {"space": layout.space, "fps": layout.fps, "licence": layout.licence, **layout.facts(place, name)}
     listed = enumerate(one for one in found if not isinstance(one, str))
@@ -220,12 +221,12 @@ def scan_split(layout: Layout, place: Path, split: str, order: Order | None = No
         layout=layout.name,
         split=split,
         clips=tuple(replace(one, row=row) for row, one in listed if isinstance(one, Clip)),
-        # A file that several clips need is one problem.
+        # The problem of a file that several clips need counts once.
         problems=tuple(dict.fromkeys(one for one in found if isinstance(one, Problem))),
         notes=tuple(one for one in found if isinstance(one, str)),
         **facts,
     )
-    if (order or layout.order) == "pose-first":  # the six channels of the pose come last in ours
+    if (order or layout.order) == "pose-first":  # in our order the six channels of the pose come last
         whole = whole.map(
             lambda dyad: replace(
                 dyad, speaker=np.roll(dyad.speaker, -6, axis=1), listener=np.roll(dyad.listener, -6, axis=1)
@@ -245,14 +246,14 @@ def scan_split(layout: Layout, place: Path, split: str, order: Order | None = No
 
 
 def wrong_order(dataset: Dataset, declared: Order | None) -> str | None:
-    """Return one line if a sample of the set looks like the other order than `declared`, naming the option to give."""
+    """Return one line with the right option if a sample of the set does not look like `declared`, else None."""
     if declared is None or not dataset.clips:
         return None
     sample = []
     for index in np.unique(np.linspace(0, len(dataset) - 1, _SAMPLE).astype(int)):
         try:
             sample.append(replace(dataset, features=())[int(index)].listener)
-        except ClipError:  # counted by whoever reads them all
+        except ClipError:  # counted when all clips are read
             continue
     seen = looks_like(sample, dataset.space, declared)
     if seen is None or seen == declared:
@@ -261,15 +262,15 @@ def wrong_order(dataset: Dataset, declared: Order | None) -> str | None:
 
 
 def looks_like(motions: Sequence[Floats], space: str, declared: Order) -> Order | None:
-    """Return the order that files look to have; `motions` (T, D) were read in the `declared` one. None: unknown.
+    """Return the order that files seem to have; `motions` (T, D) were read in the `declared` one. None: unknown.
 
-    deca56: a jaw hardly turns about y and z, and expressions do vary: two still columns end the six of the pose.
+    deca56: a jaw hardly turns about y and z while expressions vary, so the last two of the six pose columns are still.
     faceverse58: the rotation about x stays near pi, which no expression does.
     """
     if not motions or space not in ("deca56", "faceverse58"):
         return None
     filed: Doubles = np.concatenate(motions).astype(np.float64)
-    if declared == "pose-first":  # undo what reading did
+    if declared == "pose-first":  # undo the reordering of reading
         filed = np.concatenate([filed[:, -6:], filed[:, :-6]], axis=1)
     pose: dict[Order, Doubles] = {"pose-first": filed[:, :6], "exp-first": filed[:, -6:]}
     if space == "faceverse58":

@@ -1,6 +1,6 @@
 """Timing of a listener's events relative to the other person's speech.
 
-Functions on frames at 25 Hz, where no other rate is named. The phrase-end ratio compares two windows after the same
+Functions work on frames at 25 Hz unless another rate is named. The phrase-end ratio compares two windows after the same
 phrase ends, so a listener that nods at random gets 1.
 """
 
@@ -18,16 +18,16 @@ from sfms_robot.signals.events import runs
 
 AFTER_S: Final = (0.0, 0.8)  # right after a phrase end
 LATER_S: Final = (1.5, 3.0)  # compared with `AFTER_S`
-PAUSE_S: Final = 0.2  # of silence, which ends a phrase
-QUIET_DB: Final = -66.0  # of full scale: nothing below is speech
-LISTENING_S: Final = 2.0  # the other person spoke this recently
+PAUSE_S: Final = 0.2  # a silence of this length ends a phrase
+QUIET_DB: Final = -66.0  # of full scale; quieter sound is not speech
+LISTENING_S: Final = 2.0  # the listener listens for this long after the other's speech
 
 
 def voice_activity(audio: ArrayLike, frame_s: float = FRAME_S) -> Bools:
     """Detect speech per frame of `audio` (n,) by energy over an adaptive floor; an incomplete last frame is left out.
 
-    The floor is the quietest twentieth of the 8 s around; the threshold lies 8 dB above it, but always 16 to 34 dB
-    below the loud parts, so that neither hum, nor gain, nor talk without a pause confuses it. Offline: it looks ahead.
+    The floor is the 5th percentile of the level in the surrounding 8 s. The threshold lies 8 dB above it, but always 16
+    to 34 dB below the loud parts, so that hum, gain and talk without pauses are tolerated. Offline: it looks ahead.
     """
     from scipy import ndimage
 
@@ -43,7 +43,7 @@ def voice_activity(audio: ArrayLike, frame_s: float = FRAME_S) -> Bools:
     threshold_db = np.clip(floor_db + 8, loud_db - 34, loud_db - 16)
     active: Bools = (level_db > threshold_db) & (level_db > QUIET_DB)
     for start, end in runs(active):
-        active[start:end] = end - start > 1  # one frame is no speech
+        active[start:end] = end - start > 1  # a single frame is not speech
     return active
 
 
@@ -61,7 +61,7 @@ def listening_mask(voice_active: Bools, own_voice: Bools | bool = False, rate_hz
 
 
 def nods_per_minute(onsets_s: ArrayLike, listening: Bools) -> float:
-    """Return onsets inside listening time per minute of it; NaN without listening time."""
+    """Return the onsets in listening time per minute of listening time; NaN without any."""
     inside, minutes = _inside(onsets_s, listening)
     return inside / minutes if minutes else np.nan
 
@@ -81,7 +81,7 @@ def phrase_end_counts(onsets_s: ArrayLike, ends_s: Doubles, listening: Bools) ->
     """Count onsets and minutes in the two windows after phrase ends, both within listening time.
 
     Returns (onsets after, minutes after, onsets later, minutes later): add them up over people, then divide.
-    An instant that lies in both (of two phrase ends) counts in both; within one window it counts once.
+    An instant in both windows (of two phrase ends) counts in both; in two windows of one kind it counts once.
     """
     after, later = (window_after(ends_s, span_s, len(listening)) & listening for span_s in (AFTER_S, LATER_S))
     return (*_inside(onsets_s, after), *_inside(onsets_s, later))
@@ -117,7 +117,7 @@ def near(spans_s: Doubles, frames: int, within_s: float) -> Bools:
 
 
 def rank_auc(scores: Doubles, positive: NDArray[Any], negative: NDArray[Any]) -> float:
-    """Return the chance that a positive instant scores higher than a negative one, ties half; NaN without either kind.
+    """Return the chance that a positive instant scores above a negative one, ties half; NaN if one kind is missing.
 
     scores (N,); positive and negative are (N,) masks or indices.
     """
@@ -133,7 +133,7 @@ def rank_auc(scores: Doubles, positive: NDArray[Any], negative: NDArray[Any]) ->
 def find_gaze_shifts(gaze: Doubles, least_rad: float = 0.14) -> list[float]:
     """Return the seconds at which the gaze (N, 2) of head and eyes together jumps by 8 degrees or more.
 
-    A jump is a change within 0.2 s from one quarter second of rest to the next; those closer than 0.3 s are one.
+    A jump is a change within 0.2 s from one quarter second of rest to the next; jumps closer than 0.3 s count as one.
     """
     from scipy import signal
 

@@ -1,12 +1,13 @@
-"""Tables 1, 2 and 4 of the ARIG paper, without those metrics that need rendered video: FD, RPCC, SID and Var.
+"""Tables 1, 2 and 4 of the ARIG paper: FD, RPCC, SID and Var, without the metrics that need rendered video.
 
-The paper names its metrics without definitions; these are DIM's, whose rows it takes over (Frechet distance per clip,
-RPCC and Var flattened, SID in bits over 40 and 20 clusters of the truth). Its numbers (`configs/papers.yaml`) are of 64
-expression and 6 pose coefficients of Deep3DFaceRecon read off rendered video, ours of 52 blendshapes and 6 pose
-channels as sent: compare shapes. Tables 1 and 4 of the paper give RPCC, SID and Var of both parts together.
+The paper names its metrics without definitions; these are DIM's, whose rows it takes over (Frechet distance of the
+frames of all clips, RPCC and Var flattened, SID in bits over 40 and 20 clusters of the truth). Its numbers
+(`configs/papers.yaml`) are of 64 expression and 6 pose coefficients of Deep3DFaceRecon read off rendered video, ours of
+52 blendshapes and 6 pose channels as sent, so only the shapes of the tables can be compared. Tables 1 and 4 of the
+paper have RPCC, SID and Var of both parts together.
 
-The papers' listeners as written are trained where they are missing, as `configs/training/KIND-as-written.yaml` says:
-size, steps and data of the shipped listener, and nothing beyond the paper. Their weights serve the tables alone.
+The papers' listeners as written are trained if they are missing, by `configs/training/KIND-as-written.yaml`: size,
+steps and data of the shipped listener, and nothing beyond the paper. Their weights are used only for the tables.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ CLIP_FRAMES: Final = 250
 PARTS: Final = {"exp": SHAPES, "pose": POSE}
 _CLUSTERS: Final = {"exp": 40, "pose": 20}  # DIM's; the paper names none
 _NAMES: Final = tuple(f"{column} {part}" for column in ("FD", "RPCC", "SID", "Var") for part in PARTS)
-_OF_A_FOLDER: Final = str.maketrans(" ", "-", "/,")  # a row's label as a name
-_LEAST_ALIKE: Final = 0.5  # variance of faces that can be compared, over people's; at most its inverse
+_OF_A_FOLDER: Final = str.maketrans(" ", "-", "/,")  # turns a row's label into the name of a folder
+_LEAST_ALIKE: Final = 0.5  # least variance of comparable faces, over people's; the largest is the inverse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,17 +58,17 @@ class TableOptions:
     """Options of the papers' tables.
 
     Attributes:
-        data: Composed dyads; tables of ARIG need speaking/ and interaction/ in it.
+        data: Folder of composed dyads; tables of ARIG need speaking/ and interaction/ in it.
         models: Folder of listeners and tokenizers that only tables need, trained if missing; with it each table
             includes the paper as written.
-        clips: Most dyads for a table.
+        clips: Largest number of dyads for a table.
         samples: Answers to every clip of tables 1 and 2 of SFMS.
-        steps: Of every training, in place of its file's.
-        seed: Of the listeners.
+        steps: Steps of every training, in place of those of its file.
+        seed: Seed of the listeners.
         seeds: Trainings of each row of ARIG's tables, except `arig-2`.
-        split: Part of the dyads; of tables 3 and 4 the held-out recordings.
+        split: Part of the dyads; tables 3 and 4 use the held-out recordings.
         training: Training file of ARIG's ablations; None: the paper as written.
-        order, hop: Of tables 1 and 2 of SFMS; see `load_at_hop`.
+        order, hop: Options of tables 1 and 2 of SFMS; see `load_at_hop`.
     """
 
     data: Path
@@ -84,10 +85,10 @@ class TableOptions:
 
 
 def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str, Doubles]) -> dict[str, float]:
-    """Return FD, RPCC, SID and Var of expression and pose; clips (M, T, 58), an unseen speaker's face being NaN.
+    """Return FD, RPCC, SID and Var of expression and pose of clips (M, T, 58); an unseen speaker's face is NaN.
 
-    RPCC is over the clips in which the speaker's face is visible throughout; NaN without any, or if one of the three
-    motions is constant.
+    RPCC is over the clips in which the speaker's face is visible throughout; it is NaN without such clips, or if one of
+    the three motions is constant.
     """
     seen = np.isfinite(speaker).all(axis=(1, 2))
     found = []
@@ -106,10 +107,11 @@ def scores(truth: Doubles, made: Doubles, speaker: Doubles, centres: Mapping[str
 def rows_of(
     table: str, truth: Doubles, speaker: Doubles, answers: Mapping[str, Doubles], people: Sequence[str] = ()
 ) -> tuple[list[Figures], list[Figures]]:
-    """Return the rows of a table (truth, ours by name, the paper's), and what holds of the paper's statements.
+    """Return the rows of a table (truth, ours by name, the paper's), and the verdicts on the paper's statements.
 
-    Rows of all but `arig-2` have the paper's RPCC, SID and Var beside ours. Answers hold the clips of one training
-    after another. `people`: the listener of each clip of the truth, for intervals over them and over trainings.
+    In all tables but `arig-2`, rows have the paper's RPCC, SID and Var together with ours. Answers hold the clips of
+    one training after another. `people`: The listener of each clip of the truth, for intervals over people and
+    trainings.
     """
 
     def row(name: str, source: str, values: Mapping[str, float | None]) -> Figures:
@@ -139,11 +141,11 @@ def rows_of(
 def claims(
     table: str, rows: Mapping[str, Figures], draws: Mapping[str, Mapping[str, Doubles]], truth: Doubles
 ) -> list[Figures]:
-    """Return what holds of: with all parts more kinds of motion, an RPCC and a variance nearer to people's.
+    """Return verdicts on the claim that all parts make more kinds of motion, and RPCC and variance closer to people's.
 
-    Differences are of the same people, over people and trainings (`intervals.verdict`). Fewer than three trainings
-    leave it open; so does, of kinds of motion, a face that does not vary as people's do or lies far from them: noise
-    has every kind.
+    Differences are of the same people, over people and trainings (`intervals.verdict`). With fewer than three trainings
+    a verdict is open. For kinds of motion it is also open if a face does not vary as people's do or is far from them,
+    because noise has every kind of motion.
     """
 
     def alike(name: str, part: str) -> bool:
@@ -175,15 +177,15 @@ def claims(
 
 
 def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bool = True) -> Figures:
-    """Return one of ARIG's tables: `names` side by side, and for all but `arig-2` rows that are trained for it.
+    """Return one of ARIG's tables: rows of `names`, and in all tables but `arig-2` rows that are trained for the table.
 
-    `arig-2` is of the listening set; of the interaction set are `arig-1` and `arig-4`, ablations, and `arig-readings`,
-    readings of what the paper leaves open.
+    `arig-2` uses the listening set. The others use the interaction set: `arig-1` and `arig-4` have ablations, and
+    `arig-readings` has readings of points that the paper leaves open.
 
     Args:
-        name: Of `ARIG_TABLES`.
+        name: One of `ARIG_TABLES`.
         names: Listeners, by name or folder.
-        options: Of the tables.
+        options: Options of the tables.
         train: Train missing ablations; else their rows are left out.
 
     Raises ConfigError.
@@ -238,8 +240,8 @@ def trained(
 ) -> Path:
     """Return a folder with a listener of a paper, trained if it is missing: `out`, or OUT-seedN.
 
-    `file`: of the training; None: the paper as written. `more`: other fields of `TrainOptions`. Training takes half an
-    hour or more of one core; an interrupted one is resumed. Raises ConfigError.
+    `file`: Training file; None: the paper as written. `more`: Other fields of `TrainOptions`. Training takes half an
+    hour or more of one core; an interrupted training is resumed. Raises ConfigError.
     """
     file = file or data_dir("configs") / "training" / f"{kind}-as-written.yaml"
     out = out if seed is None else out.with_name(f"{out.name}-seed{seed}")
@@ -260,7 +262,7 @@ def trained(
 # --- evaluate papers -------------------------------------------------------------------------------------------------
 
 _SFMS, _ARIG = "sfms-small", "arig-small"
-_TRAIN_DYADS: Final = 200  # from which the heuristics take their means
+_TRAIN_DYADS: Final = 200  # dyads from which the heuristics compute their means
 _SFMS_TABLES: Final = ("1", "2")
 EVERY: Final = (*_SFMS_TABLES, *TOKENIZER_TABLES, *ARIG_TABLES)
 
@@ -268,8 +270,9 @@ EVERY: Final = (*_SFMS_TABLES, *TOKENIZER_TABLES, *ARIG_TABLES)
 def evaluate_papers(options: TableOptions, tables: Sequence[str], each: Callable[[str, Figures], None]) -> Figures:
     """Return the `tables` (of `EVERY`); call `each(name, table)` as soon as one is done.
 
-    Without a folder of models their rows are left out, and `not_trained` of a table lists how to make them. Blocks for
-    minutes; for hours if listeners have to be trained. An interrupted training is resumed. Raises ConfigError.
+    Without a folder of models the rows of trained models are left out, and `not_trained` of a table lists how to make
+    them. Blocks for minutes; for hours if listeners have to be trained. An interrupted training is resumed. Raises
+    ConfigError.
     """
     unknown = [name for name in tables if name not in EVERY]
     if unknown:
@@ -309,7 +312,7 @@ def sfms_table(number: int, names: Sequence[str], options: TableOptions) -> Figu
 
 
 def _not_trained(name: str) -> dict[str, str]:
-    """Return the missing rows of a table, and what makes them."""
+    """Return the missing rows of a table, each with the command that makes it."""
     if name in TOKENIZER_TABLES:
         lacking = set(needed(name)) - set(needed(name, shipped=True))
         return dict.fromkeys(sorted(lacking), f"evaluate tokenizer --table {name} --models DIR, minutes each")

@@ -1,7 +1,7 @@
 """Quality of the detectors of events in motion, measured on known events.
 
-People's nods are annotated, a listener's are found in its motion: before the two are compared the finder is tried on
-motion composed from known nods. The same count shows whether a listener performs what it has decided.
+People's nods are annotated, while a listener's nods are detected in its motion. Before the two are compared, the
+detector is tested on motion composed from known nods. The same count shows whether a listener performs its decisions.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sfms_robot.signals.gaze_kinematics import EYE_CHANNELS, EYES_RAD, direction
 from sfms_robot.signals.motion_primitives import Motions
 
 _IN_TIME_S: Final = 0.12
-_LOOSE_S: Final = 0.5  # further apart is not a pair
+_LOOSE_S: Final = 0.5  # largest distance of the events of a pair
 _EDGE_S: Final = 1.0  # an event that begins this close to the end of a motion may not be over
 _SIZES: Final[Mapping[str, tuple[float, ...]]] = {  # edges of the ranges of sizes
     "nod": tuple(np.deg2rad([0, 2, 3, 4, 6, 9, 180])),
@@ -37,12 +37,13 @@ _SIZES: Final[Mapping[str, tuple[float, ...]]] = {  # edges of the ranges of siz
 
 @dataclass(frozen=True)
 class Sightings:
-    """Requested events of one kind, beside the events that a detector saw; those of several motions can be added.
+    """Requested events of one kind and the events that a detector saw; sightings of several motions can be added.
 
     Attributes:
-        sizes: (K,) of the requested events; in_time: (K,) 1 if seen within 0.12 s of the due time.
-        seen: How many the detector saw.
-        late_s: Lateness of those within 0.5 s of a requested one.
+        sizes: (K,) sizes of the requested events.
+        in_time: (K,) 1 if the requested event was seen within 0.12 s of the due time.
+        seen: Number of events that the detector saw.
+        late_s: Lateness of the seen events within 0.5 s of a requested one.
     """
 
     sizes: Doubles = field(default_factory=lambda: np.zeros(0))
@@ -60,21 +61,21 @@ class Sightings:
 
     @property
     def recall(self) -> float:
-        """Return the share of requested events seen in time; NaN of none."""
+        """Return the share of requested events seen in time; NaN without any."""
         return float(self.in_time.mean()) if len(self.in_time) else np.nan
 
     @property
     def precision(self) -> float:
-        """Return the share of seen events that were requested, in time; NaN of none."""
+        """Return the share of seen events that were requested, in time; NaN without any."""
         return float(self.in_time.sum() / self.seen) if self.seen else np.nan
 
     @property
     def offset_s(self) -> float:
-        """Return the median lateness; NaN of none."""
+        """Return the median lateness; NaN without any."""
         return middle(self.late_s)
 
     def recall_at(self, sizes: Doubles, edges: Sequence[float]) -> float:
-        """Return the recall that events of these sizes would have, by the recall of each range between `edges`."""
+        """Return the expected recall of events of these sizes, from the recall of each range between `edges`."""
         here, there = np.digitize(self.sizes, edges), np.digitize(sizes, edges)
         known = {place: self.in_time[here == place].mean() for place in np.unique(here)}
         found = [known[place] for place in there if place in known]
@@ -99,7 +100,7 @@ class Sightings:
         }
 
     def figures(self, recall: float) -> dict[str, float | None]:
-        """Return a recall beside the precision and lateness; None where undefined."""
+        """Return a recall with the precision and lateness; None where undefined."""
         return {"recall": rounded(recall), "precision": rounded(self.precision), "offset_s": rounded(self.offset_s)}
 
 
@@ -110,10 +111,10 @@ def seen(motion: Floats, kind: str) -> list[tuple[float, float, float]]:
 
 
 def _pitch(motion: Floats) -> Doubles:
-    """Return the pitch (N,) of motion (N, 58) without the head's part of looking.
+    """Return the pitch (N,) of motion (N, 58) without the head's part in gaze shifts.
 
-    The head goes along with a look aside and comes back, which is not a nod. Eyes that do not move at all are not
-    tracked: then nothing is removed.
+    The head moves with a look aside and comes back, which is not a nod. Eyes that do not move at all are not tracked,
+    and then nothing is removed.
     """
     pitch = motion[:, CHANNEL_INDEX["pitch"]].astype(float)
     return pitch - head_part(gaze_rad(motion))[:, 1] if motion[:, list(EYE_CHANNELS)].any() else pitch
@@ -139,10 +140,10 @@ class Detected:
 def asked_and_seen(
     asked: Sequence[ListenerEvent], detected: Detected, lag_s: Mapping[str, float] | None = None
 ) -> dict[str, Sightings]:
-    """Return by kind which requested events were detected, and when.
+    """Return by kind which requested events were detected, and how late.
 
-    Times count from the beginning of the first frame. `lag_s`: the lateness by nature of each kind (a smile has to
-    rise), which does not count. Of several candidates the nearest pairs go together.
+    Times count from the beginning of the first frame. `lag_s`: The usual lateness of each kind (a smile has to rise),
+    which does not count against being in time. Of several candidates the nearest are paired first.
     """
     last_s = detected.frames * FRAME_S - _EDGE_S
     found = {}
@@ -212,7 +213,7 @@ class DetectorCalibration:
 
     @property
     def nods_per_seen_nod(self) -> float:
-        """Return how many nods there are for each one seen; 1 without data."""
+        """Return the number of true nods per seen nod; 1 without data."""
         nods = self.known.get("nod", Sightings())
         return nods.precision / nods.recall if nods.in_time.any() else 1.0
 
@@ -253,8 +254,8 @@ def busy_minute(rng: np.random.Generator) -> Score:
 
 # --- Statistics of behaviour -----------------------------------------------------------------------------------------
 #
-# `behaviour` has rates beside a dyad: nods, blinks, smiles, stillness, smoothness. `movement` describes each kind of
-# motion: nods, blinks, smiles, gaze, and slow sway.
+# `behaviour` returns figures of listeners with their dyads: nods, blinks, smiles, stillness, smoothness. `movement`
+# describes each kind of motion: nods, blinks, smiles, gaze, and slow sway.
 
 SWAY_BANDS_HZ: Final = ((0.05, 0.1), (0.1, 0.2), (0.2, 0.4))
 _ROTATIONS: Final = slice(0, 3)
@@ -263,15 +264,15 @@ _ON_PERSON_RAD: Final = np.deg2rad(5.0)
 _FIXATION_RAD: Final = np.deg2rad(2.0)  # a look ends when gaze is that far from where it began
 _SHIFT_RAD: Final = np.deg2rad(5.0)
 _SWAY_WINDOW: Final = 20 * FRAME_HZ
-_CYCLE: Final = 0.25  # of the depth of a nod: less between two peaks does not part them
+_CYCLE: Final = 0.25  # share of a nod's depth; two peaks with a shallower dip between them are one cycle
 _SLOW: Final = 10 * FRAME_HZ  # frames whose median is a slow pose
 _LEFT: Final = {"blink": "eyeBlinkLeft", "smile": "mouthSmileLeft"}
 
 
 def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, float]:
-    """Return figures of listeners (N, 58), each beside the dyad it belongs to; NaN where there is no data.
+    """Return figures of the motions of listeners (N, 58), each with its dyad; NaN where there is no data.
 
-    Rates are per minute, nods over listening time. nod_deg: median peak to peak. phrase_end_ratio: nod onsets just
+    Rates are per minute, nods per minute of listening. nod_deg: median peak to peak. phrase_end_ratio: nod onsets just
     after phrase ends over those later on. still_share: share of seconds in which the head turns less than 0.1 degree.
     speed, acceleration and jerk: 99.9th percentiles of the head's rotation.
     """
@@ -304,12 +305,12 @@ def behaviour(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> dict[str, flo
 
 
 def middle(values: Sequence[float] | Doubles) -> float:
-    """Return the median; NaN of no values."""
+    """Return the median; NaN without values."""
     return float(np.median(values)) if len(values) else np.nan
 
 
 def _lasted_s(motions: Sequence[Floats], kind: str) -> list[float]:
-    """Return how long each event of a kind lasts, as the left side of the face shows it."""
+    """Return the length [s] of each event of a kind, measured on the left side of the face."""
     find, channel = MOTION_EVENTS[kind].find, CHANNEL_INDEX[_LEFT[kind]]
     return [end - start for motion in motions for start, end, _ in find(motion[:, channel], FRAME_HZ)]
 
@@ -356,12 +357,12 @@ def movement(motions: Sequence[Floats], addressed: Sequence[Bools]) -> dict[str,
 def nods_of(motions: Sequence[Floats]) -> Doubles:
     """Return (K, 4): size peak to peak [rad], length [s], length of a cycle [s], and number of cycles of each nod.
 
-    The length of a nod is its full width at half depth, in recorded and in drawn motion alike: from where the pitch
-    passes half the depth of the first cycle to where it comes back to half the depth of the last. Depths count from the
+    The length of a nod is its full width at half depth, for recorded and for drawn motion: from where the pitch passes
+    half the depth of the first cycle to where it comes back to half the depth of the last. Depths are measured from the
     line between the pitch before and after the nod. The length of a cycle is its own full width at half depth, the
     median of all. Two lowest points with less than a quarter of the depth between them are one cycle.
 
-    Neither what a filter adds around a nod nor the instant at which an annotator pressed a key is part of it.
+    The length does not include the margins that a filter adds around a nod, nor the time of an annotator's key press.
     """
     nods = []
     for motion in motions:
@@ -369,7 +370,7 @@ def nods_of(motions: Sequence[Floats]) -> Doubles:
         for start, end, size in events.find_nods(pitch, FRAME_HZ):
             swing = pitch[round(start * FRAME_HZ) : round(end * FRAME_HZ) + 1]
             swing = swing - np.linspace(swing[0], swing[-1], len(swing))
-            swing *= np.copysign(1, swing.max() + swing.min())  # the larger way is up
+            swing *= np.copysign(1, swing.max() + swing.min())  # the larger swing becomes positive
             peaks, depths = events.find_peaks(swing, _CYCLE * swing.max())
             before, after = np.array(events.half_widths(swing, peaks, depths)) / FRAME_HZ
             nods.append((size, after[-1] - before[0], np.median(after - before), len(peaks)))
@@ -377,7 +378,7 @@ def nods_of(motions: Sequence[Floats]) -> Doubles:
 
 
 def looks_s(gaze: Doubles) -> list[float]:
-    """Return how long gaze (N, 2) stays within 2 degrees of where it settled, per look; the last one is dropped."""
+    """Return the time [s] for which gaze (N, 2) stays within 2 degrees of where it settled, per look but the last."""
     found, first = [], 0
     for frame in range(1, len(gaze)):
         if np.hypot(*(gaze[frame] - gaze[first])) > _FIXATION_RAD:

@@ -1,4 +1,4 @@
-"""`evaluate interaction`: numbers for what ARIG's paper leaves to the eye: states, lips, chunk borders."""
+"""`evaluate interaction`: numbers for qualities that ARIG's paper judges by eye: states, lips, chunk borders."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.registry import load_listener
 
-_LAGS: Final = 12  # frames in both directions in which the jaw is searched
+_LAGS: Final = 12  # largest lag of the jaw in the search, in frames in both directions
 _JAW: Final = CHANNEL_INDEX["jawOpen"]
-_STILL: Final = 1e-4  # deviation of a jaw that does not move
+_STILL: Final = 1e-4  # a jaw with a smaller deviation does not move
 
 States = NDArray[np.int8]
 
@@ -34,7 +34,7 @@ States = NDArray[np.int8]
 def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, split: str = "test") -> Figures:
     """Return figures of states, lips, chunk borders and the end of speech on the sets of `data` of a split.
 
-    At most `clips` dyads of each set. Raises ConfigError for a listener without states, or data without such sets.
+    Uses at most `clips` dyads of each set. Raises ConfigError for a listener without states, or data without such sets.
     """
     listener = load_listener(name)
     settings = getattr(getattr(listener, "how", listener), "settings", None)
@@ -67,7 +67,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, sp
 
 
 def _states(rolled: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips: int | None) -> Figures:
-    """Return accuracies of the listener's states, and of two rules on voices that the training labels give."""
+    """Return accuracies of the listener's states, and of two rules on voices that follow from the training labels."""
     labelled = [
         (one.states[0], dyad, dyad.states) for one, dyad in zip(rolled, dyads, strict=True) if dyad.states is not None
     ]
@@ -75,7 +75,7 @@ def _states(rolled: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips:
     if (said < 0).all():
         return {}
     truth = np.concatenate([states for _, _, states in labelled])
-    truth = np.where(said < 0, UNKNOWN, truth).astype(np.int8)  # the first frame of a stream is given
+    truth = np.where(said < 0, UNKNOWN, truth).astype(np.int8)  # the state of a stream's first frame is not predicted
     voices = np.concatenate([voice_tracks(dyad) for _, dyad, _ in labelled])
     tables = {
         name: confusion(answers, truth) for name, answers in {"state": said, **_by_rule(voices, data, clips)}.items()
@@ -89,7 +89,7 @@ def _states(rolled: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips:
 def _by_rule(voices: Bools, data: Path, clips: int | None) -> dict[str, States]:
     """Return the answers of the most frequent state and of the best voice rule of training for voices (N, 2).
 
-    The best that voice activity alone can do is the most frequent state of each pattern of speech, agent x user.
+    The best rule from voice activity alone is the most frequent state of each pattern of speech, agent x user.
     """
     learned = [
         (voice_tracks(dyad), dyad.states)
@@ -109,7 +109,7 @@ def _by_rule(voices: Bools, data: Path, clips: int | None) -> dict[str, States]:
 
 
 def voice_tracks(dyad: Dyad) -> Bools:
-    """Return the speech (N, 2) of agent and user as the listener hears it: the agent's now, the user's a frame late."""
+    """Return the speech (N, 2) of agent and user as the listener gets it: the agent's now, the user's a frame late."""
     silent = np.zeros(len(dyad.listener), bool)
     agent, user = (
         silent if track is None else audio_frontend.track(track)[1] for track in (dyad.agent_audio, dyad.audio)
@@ -126,9 +126,9 @@ def confusion(said: States, states: States) -> NDArray[np.int64]:
 
 
 def accuracies(table: NDArray[np.int64]) -> tuple[float, float]:
-    """Return the share on the diagonal, and the mean over the states that occur of the share found; NaN without any.
+    """Return the share on the diagonal, and the mean over the occurring states of the share found; NaN without any.
 
-    By the second a constant answer gets 1 over the number of states.
+    A constant answer has a second figure of 1 over the number of these states.
     """
     of, found = table.sum(axis=1), np.diag(table)
     if not of.any():
@@ -140,10 +140,10 @@ def accuracies(table: NDArray[np.int64]) -> tuple[float, float]:
 
 
 def jaw_tracking(made: Sequence[Floats], recorded: Sequence[Floats]) -> dict[str, float]:
-    """Return how the jaw of motions (N, 58) follows the recorded ones; pairs of 24 frames or fewer drop out.
+    """Return how the jaw of motions (N, 58) follows the recorded ones; pairs of 24 frames or fewer are left out.
 
-    correlation at lag 0, over all clips, each less its mean; the lag (positive: late) with the highest correlation, and
-    that; and the deviation of the jaw over that of the recorded one.
+    The figures are the correlation at lag 0, over all clips, each minus its mean; the lag (positive: late) with the
+    highest correlation, and this correlation; and the deviation of the jaw over that of the recorded jaw.
     """
     long = [(a[:, _JAW], b[:, _JAW]) for a, b in zip(made, recorded, strict=True) if len(a) > 2 * _LAGS]
 
@@ -183,7 +183,7 @@ def border_ratio(motions: Sequence[Floats], period: int) -> float:
 
 
 def listening_again(motions: Sequence[Floats], dyads: Sequence[Dyad]) -> float:
-    """Return the mean jaw opening a second and more after the agent's own voice over that during it."""
+    """Return the mean jaw opening more than a second away from the agent's own voice, over the mean during it."""
     speaking, after = [NO_SOUND], [NO_SOUND]
     for one, dyad in zip(motions, dyads, strict=True):
         if dyad.agent_audio is None:

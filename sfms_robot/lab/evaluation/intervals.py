@@ -21,7 +21,7 @@ from sfms_robot.lab.corpora.clips import Dyad, series
 LEVEL: Final = 0.95
 DRAWS: Final = 2000
 _DEFINED: Final = 0.9  # share of the draws in which a figure has to be defined to have an interval
-LEAST_SEEDS: Final = 3  # trainings, for what a paper states
+LEAST_SEEDS: Final = 3  # least number of trainings for a verdict on a paper's statement
 _LEAST_PEOPLE: Final = 3
 
 Sums = dict[str, Doubles]  # of one person: name -> numbers (K,)
@@ -44,7 +44,7 @@ def ends(values: Doubles) -> Doubles:
 
 
 def rounded(value: float | None, digits: int = 4) -> float | None:
-    """Return a figure as reports have it; None without one, or if it is not finite."""
+    """Return a figure rounded for a report; None if there is no figure, or if it is not finite."""
     return None if value is None or not np.isfinite(value) else round(float(value), digits)
 
 
@@ -78,7 +78,7 @@ def estimates(
 ) -> dict[str, Estimate]:
     """Return every figure of all people with its interval (percentiles over `draws` sets of as many people).
 
-    All people have the same names. One seed gives the same sets for any figures.
+    The sums of all people have the same names. The same seed draws the same sets for any figures.
     """
     count = len(people)
     weights = np.concatenate([np.ones((1, count)), draw_people(count, seed, draws)])  # all people once, then the draws
@@ -151,14 +151,14 @@ def bootstrap(
 ) -> dict[str, Doubles]:
     """Return each figure of `score(clips)` in `draws` sets of people (R,), NaN where it is not finite.
 
-    One seed gives the same people for any score, so two of these subtract pair by pair. Empty for fewer than three
-    people.
+    The same seed draws the same people for any score, so two results can be subtracted draw by draw. Empty for fewer
+    than three people.
 
     Args:
         score: Figures of the clips at these places, which may repeat.
         people: The listener of each clip.
         runs: The training of each clip's motion, drawn with replacement too; empty: one training.
-        seed: Of the draws.
+        seed: Seed of the draws.
         draws: Number of sets.
     """
     names, who = np.unique(np.asarray(people), return_inverse=True)
@@ -191,10 +191,10 @@ Verdict = Literal["holds", "does not hold", "open"]
 
 
 def verdict(interval: tuple[float, float] | None, *, comparable: bool = True) -> Verdict:
-    """Return whether "above 0", as a paper states it, holds of a figure with this interval.
+    """Return the verdict on a paper's statement that a figure with this interval is above 0.
 
-    It holds where the whole interval is above 0 and does not hold where the whole interval is at or below it. Else,
-    without an interval, and where what is compared is not `comparable`, it is open.
+    It holds if the whole interval is above 0, and does not hold if the whole interval is at or below 0. Otherwise it is
+    open, also without an interval, or if the compared figures are not `comparable`.
     """
     if interval is None or not comparable:
         return "open"

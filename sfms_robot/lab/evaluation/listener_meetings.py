@@ -1,8 +1,8 @@
-"""A meeting around one of its people: what reaches the listener from the others, and what the listener did.
+"""A meeting around one of its people: the listener's input from the others, and the listener's own events.
 
-Everything but the listener's own behaviour is kept: the speech of the others becomes a voice and a face, as in composed
-dyads; the face laughs and nods when they did, and the annotation says whether the person who speaks looks at the
-listener. `shifted` puts another minute of the others in the place of each.
+Everything except the listener's own behaviour is kept: the speech of the others becomes a voice and a face, as in
+composed dyads; the face laughs and nods when they did, and the annotation states whether the person who speaks looks at
+the listener. `shifted` replaces each minute of the others by another minute.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class ListenerMeeting:
 
     @property
     def history(self) -> tuple[ListenerEvent, ...]:
-        """Return the annotated events that a listener model has, in their order; nods only while listening."""
+        """Return the annotated events, in order, as the history of a listener model; nods only while listening."""
         nods = self.spans_s["nod"][self.listening[self.instants("nod")]]
         found = []
         for kind, spans in {**self.spans_s, "nod": nods}.items():
@@ -91,10 +91,10 @@ class ListenerMeeting:
         return tuple(sorted(found, key=lambda event: event.start_s))
 
     def begins(self, kind: str) -> tuple[Ints, Bools]:
-        """Return (K,) last frames before the events of a kind that begin where they may, and (N,) where they may.
+        """Return last frames (K,) before the events of a kind that begin in allowed frames, and these frames (N,).
 
-        Events may begin while the listener listens and is not inside one; a look aside may begin while the listener
-        looks at the person who speaks or has the floor, and other gaze shifts do not count.
+        Events may begin while the listener listens and no event of the kind is under way; a look aside may begin while
+        the listener looks at the person who speaks or has the floor, and other gaze shifts do not count.
         """
         instants = self.instants(kind)
         if kind == "gaze_shift":
@@ -106,17 +106,17 @@ class ListenerMeeting:
 
     @property
     def looks_at_speaker(self) -> Bools:
-        """Return (N,): the newest look did not go aside."""
+        """Return (N,): the newest gaze shift did not go aside."""
         shifts = self.instants("gaze_shift") + 1
         newest = np.searchsorted(shifts, np.arange(self.frames), side="right") - 1
         return np.asarray((newest >= 0) & ~np.r_[self.aside, False][newest])
 
     def instants(self, kind: str) -> Ints:
-        """Return (K,) the last frame that is over when each event of the kind begins."""
+        """Return (K,) the last frame that is complete when each event of the kind begins."""
         return frames_before(self.spans_s[kind][:, 0], self.frames)
 
     def inside(self, kind: str) -> Bools:
-        """Return (N,): an event of the kind is under way when the frame is over."""
+        """Return (N,): an event of the kind is under way at the end of the frame."""
         mask = np.zeros(self.frames, bool)
         for start, end in self.spans_s[kind] * FRAME_HZ:
             mask[int(np.floor(start + 1e-6)) : max(0, int(np.ceil(end - 1e-6)) - 1)] = True
@@ -124,7 +124,7 @@ class ListenerMeeting:
 
 
 def frames_before(starts_s: Doubles, frames: int) -> Ints:
-    """Return the last frame (K,), of `frames`, that is over at each instant (K,)."""
+    """Return the last frame (K,), of `frames`, that is complete at each instant (K,)."""
     before = np.floor(starts_s * FRAME_HZ + 1e-6).astype(np.int64) - 1
     return before.clip(0, frames - 1)
 
@@ -195,6 +195,6 @@ def part(speaker: Sequence[SpeakerFrame], first: int, frames: int) -> list[Speak
 
 
 def shifted(speaker: Sequence[SpeakerFrame]) -> Sequence[SpeakerFrame]:
-    """Return the frames `SHIFT_S` late, the end at the beginning; their times and own voice move with them."""
+    """Return the frames delayed by `SHIFT_S`, the end at the beginning; their times and own voice move with them."""
     at = -round(SHIFT_S * FRAME_HZ) % len(speaker)
     return [*speaker[at:], *speaker[:at]]

@@ -1,10 +1,10 @@
-"""Tables I and II of the SFMS paper, on any data: listeners and heuristics beside the paper's rows.
+"""Tables I and II of the SFMS paper, on any data: listeners and heuristics, with the paper's rows.
 
-The paper does not say how its numbers were computed; each choice is stated where it is made. Table 1 is that of the
-Learning2Listen line, expression and rotation apart; table 2 that of the REACT challenge, which scores 25 attributes
-that no public code derives from coefficients: here it is computed on the coefficients, with ReactFace's FRDist. FRRea
-needs rendered pictures and is out of scope. The paper's rows (`configs/papers.yaml`) come from other data and spaces:
-compare their shapes.
+The paper does not state how its numbers were computed; each choice is stated where it is made. Table 1 has the metrics
+of the Learning2Listen line, separately for expression and rotation. Table 2 has the metrics of the REACT challenge,
+which scores 25 attributes that no public code derives from coefficients. Here it is computed on the coefficients, with
+ReactFace's FRDist. FRRea needs rendered pictures and is out of scope. The paper's rows (`configs/papers.yaml`) come
+from other data and spaces, so only the shapes of the tables can be compared.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from sfms_robot.listeners.sfms.stream import SfmsListener
 from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.ports import Listener
 
-FRAMES: Final = {1: 64, 2: 750}  # of a clip: Learning2Listen's and REACT's
+FRAMES: Final = {1: 64, 2: 750}  # frames of a clip by table: Learning2Listen's and REACT's
 _LEAST_SPREAD: Final = 1e-6  # smaller spreads would divide by nearly nothing
 
 PRINTED: Final = read(data_dir("configs") / "papers.yaml")
@@ -61,7 +61,7 @@ Score = Callable[[Chosen], Figures]  # figures of some of the clips
 
 
 def paper_rows(table: str) -> dict[str, dict[str, float | None]]:
-    """Return the rows that a paper prints in a table, by name: its figures by column; None where it leaves one out."""
+    """Return the printed rows of a paper's table by name, with their figures by column; None for a missing figure."""
     printed = PRINTED[table]
     return {name: dict(zip(printed["columns"], row, strict=True)) for name, row in printed["rows"].items()}
 
@@ -117,7 +117,7 @@ def _features(number: int, space: str) -> str:
 
 
 def heuristics(clips: Clips, samples: int, seed: int) -> dict[str, Doubles]:
-    """Return the answers (N, K, T, D) of listeners that learn nothing; all but Random give K equal answers.
+    """Return the answers (N, K, T, D) of listeners without training; all but Random return K equal answers.
 
     Random, Mime and MeanFr as in `run_baselines` of the REACT challenge (baseline_react2023 @ c5a8ff85), Median as
     Learning2Listen names it. Random draws every number uniformly from its channel's range (0..1 for blendshapes, else
@@ -141,7 +141,7 @@ def heuristics(clips: Clips, samples: int, seed: int) -> dict[str, Doubles]:
 def held(truth: Doubles, frames: int = 8) -> Doubles:
     """Return clips (N, T, D) in which the last true frame before each plan of `frames` frames is repeated.
 
-    An answer of this kind knows nothing but the true past: what a figure says of it, no listener has to be asked.
+    Such an answer contains only the true past: a value that it reaches in a figure does not require any listener.
     """
     at = np.arange(truth.shape[1])
     return truth[:, np.maximum(at // frames * frames - 1, 0)]
@@ -175,9 +175,9 @@ def _table_1(clips: Clips) -> Callable[[Doubles], Score]:
 
 
 def _scale(clips: Clips) -> Callable[[Doubles], Doubles]:
-    """Return the map to the units of L2L's numbers for its coefficients; other spaces less the mean of training.
+    """Return a function that scales L2L's coefficients to the units of its numbers, else subtracts the training mean.
 
-    Var and RPCC take all channels for one signal: of a head that rests at pi about x they would see nothing else.
+    Var and RPCC treat all channels as one signal: if a head rests at pi about x, this offset would determine them.
     """
     if clips.space != "deca56":
         rest = clips.train.mean(axis=(0, 1))
@@ -252,9 +252,9 @@ def evaluate_listener(
     hop: int | None = None,
     split: str = "test",
 ) -> Figures:
-    """Stream the held-out speakers of `data` through listeners; return their behaviour beside that of the dyads.
+    """Stream the held-out speakers of `data` through listeners; return their behaviour and that of the dyads.
 
-    For an SFMS listener the rows also have its keyframe scores. `hop`: see `load_at_hop`.
+    Rows of SFMS listeners also have their keyframe scores. `hop`: see `load_at_hop`.
     """
     dyads = [*streamable(data, split, order)]
     if not dyads:
@@ -279,9 +279,9 @@ def evaluate_listener(
 
 
 def shared_space(listeners: Mapping[str, Listener]) -> MotionSpace:
-    """Return the motion space of all listeners; of one that decides events, that of its model of motion.
+    """Return the motion space of all listeners; for one that decides events, the space of its motion model.
 
-    Raises ConfigError when there are several.
+    Raises ConfigError if there are several.
     """
     spaces = {
         name: getattr(getattr(listener, "how", listener), "space", MotionSpace("arkit58", np.zeros(58)))
@@ -316,7 +316,7 @@ def collect(
 ) -> tuple[Clips, dict[str, Doubles]]:
     """Return the clips of a table, and the answers of every listener (N, K, T, D), K seeds.
 
-    A listener hears a dyad from its beginning; clips are cut out of its answer. Raises ConfigError when the dyads are
+    A listener gets each dyad from its beginning; clips are cut out of its answer. Raises ConfigError if the dyads are
     too short for the table's metrics.
     """
     learned = [np.asarray(in_space(dyad, dyad.listener, space)) for dyad in train]
@@ -328,7 +328,7 @@ def collect(
             f"table {number} needs clips of {metrics.NEEDED_FRAMES[number]} frames, the longest has {longest}"
         )
     rest = torch.tensor(space.neutral, dtype=torch.float32)
-    faces = [np.asarray(torch.where(one.face_known[:, None], one.face, rest)) for one in heard]  # unknown: at rest
+    faces = [np.asarray(torch.where(one.face_known[:, None], one.face, rest)) for one in heard]  # at rest if unknown
     clips = Clips(
         space=space.name,
         truth=cut([np.asarray(one.motion) for one in heard], frames),
@@ -348,7 +348,7 @@ def collect(
 
 
 def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequence[int], frames: int) -> Doubles:
-    """Return (S, N, D) in the space; the end that does not fill a clip may be missing."""
+    """Return the answers (S, N, D) in the space; an end that does not fill a clip may be missing."""
     if isinstance(listener, SfmsListener):
         return np.asarray(offline_rollout(listener, dyad, seeds).motion)
     if dyad.space != "arkit58":

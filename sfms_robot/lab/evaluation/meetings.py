@@ -1,8 +1,8 @@
-"""`evaluate timing`: listeners hear meetings, and their behaviour is compared with that of the people.
+"""`evaluate timing`: meetings are played to a listener, and its behaviour is compared with that of the people.
 
 The hazards of a listener, if it has any, are computed for the whole of every meeting, and its motion for some minutes.
-Each process takes one person's meeting; randomness depends on the seed and on the person's place in the tables alone,
-so the figures do not depend on the number of processes.
+Each process plays one person's meeting at a time. Random numbers depend only on the seed and on the person's place in
+the tables, so the figures do not depend on the number of processes.
 """
 
 from __future__ import annotations
@@ -73,13 +73,13 @@ class TimingOptions:
 
     Attributes:
         listener: Shipped name, folder, or a file of hazards (`train events`), which has no motion.
-        split: Of the people; "train" needs `allow_training`, since listeners were trained on these people.
-        meetings: Most meetings to play, spread over all; None: all.
-        minutes: Of motion, from the middle of each meeting; 0: none, which takes minutes instead of hours.
-        seeds: How often a listener is left to itself in each.
+        split: Split of the people; "train" needs `allow_training`, since listeners were trained on these people.
+        meetings: Largest number of meetings to play, spread over all; None: all.
+        minutes: Length of motion, from the middle of each meeting; 0: none, which takes minutes instead of hours.
+        seeds: Number of free runs of the listener in each meeting.
         jobs: Processes; None: as many as there are cores.
         hop, engine: See `load_at_hop`.
-        own_voice: A listener that is left to itself speaks when the person did; else it never speaks.
+        own_voice: In free runs the listener speaks when the person did; else it never speaks.
     """
 
     listener: str
@@ -109,7 +109,7 @@ def evaluate_timing(options: TimingOptions) -> Figures:
 
     Raises ConfigError or ModelError.
     """
-    listener = _listener(options)  # report its errors here, not from a process
+    listener = _listener(options)  # raises its errors here, not in a process
     people = read_people(tables(options.data))
     chosen = spread(people_of(people, options.split, options.allow_training), options.meetings)
     training = split_series(people)["train"]
@@ -184,8 +184,8 @@ def _play(
 ) -> _Played:
     """Play one meeting: the person's events, the listener's hazards, decisions and motion.
 
-    `baselines` are of training people: nods per minute (CELLS,) by speech phase, and the reference. `task`: place in
-    the tables, and person.
+    `baselines` are of training people: nods per minute (CELLS,) by speech phase, and the reference. `task`: The place
+    in the tables, and the person.
     """
     number, person = task
     voices, laughter, motions = _material(options.split, options.data)
@@ -205,8 +205,9 @@ def _play(
     if isinstance(listener, EventfulListener):
         model, calmness = listener.when, listener.calmness
     if isinstance(model, EventModel):
-        # Given the person's history the hazards rank the person's events. They are also computed from the annotations,
-        # without the losses of sensing; and from those with all others as one person, as for a single microphone.
+        # The hazards, given the person's history, rank the person's events. They are also computed from the
+        # annotations, without the losses of sensing, and from annotations in which all others are one person, as for a
+        # single microphone.
         hazards = partial(hazards_in, model, own=one.history, calmness=calmness)
         with_voice, heard = sensed(one.speaker, calmness)
         speaking, silent = delayed(hazards(with_voice)), hazards(heard)
@@ -256,7 +257,7 @@ def _material(split: Split, data: Path) -> tuple[Sequence[VoiceClip], Sequence[F
 
 
 def _rows(name: str, found: Mapping[str, Estimate]) -> list[Figures]:
-    """Return one row per figure: of the motion or the hazards, beside the same figure of the other sources."""
+    """Return one row per figure: that of the motion or the hazards, and the same figure of the other sources."""
 
     def bare(key: str) -> str:
         return next((key.removeprefix(prefix) for prefix in _PREFIXES.values() if key.startswith(prefix)), key)
@@ -277,14 +278,15 @@ def _rows(name: str, found: Mapping[str, Estimate]) -> list[Figures]:
 
 # --- Decisions without motion ----------------------------------------------------------------------------------------
 #
-# There are two ways. Left to itself it decides, and its history is what it decided. Given a person's history it decides
-# nothing: only its hazards are computed, at every instant, as if it had done what the person did so far. These are
-# ranked against what the person did next: nods drawn from good hazards with a few seeds rank hardly better than chance.
+# A listener is evaluated in two ways. In a free run it decides, and its history consists of its own decisions. Given a
+# person's history it decides nothing: only its hazards are computed, at every instant, as if the person's events so far
+# were its own. These are ranked against the person's next events, because nods drawn from good hazards with a few seeds
+# rank hardly better than chance.
 #
-# `ReferenceHazard` is the bar: what the annotations themselves reveal about nods. A logistic hazard of speech and its
-# length, of looks, laughs and nods, and of the person's earlier nods, fitted on training people and evaluated at every
-# instant of another person's meeting. It gets exactly what the annotators saw, where a head has a microphone and a
-# camera; once with the person's own speech, and once fitted and evaluated without.
+# `ReferenceHazard` is the reference: the information about nods in the annotations themselves. It is a logistic hazard
+# of speech and its length, of looks, laughs and nods, and of the person's earlier nods, fitted on training people and
+# evaluated at every instant of another person's meeting. Its input is exactly what the annotators saw, while a head has
+# a microphone and a camera. It is fitted and evaluated once with the person's own speech, and once without.
 
 _SILENT: Final = {name: knots for name, knots in STUDY.items() if name not in ("floor_mine", "own_voice_s")}
 
@@ -296,9 +298,9 @@ def sensed(speaker: Sequence[SpeakerFrame], calmness: Calmness) -> tuple[Doubles
 
 
 def annotated(scene: Scene, frames: int) -> tuple[Doubles, Doubles, Doubles]:
-    """Return the evidence (frames, len(HEARD)) that annotators saw in place of a microphone and a camera.
+    """Return the evidence (frames, len(HEARD)) from annotations in place of a microphone and a camera.
 
-    With the listener's own voice, without it, and without it while the others are a minute off.
+    There are three: with the listener's own voice, without it, and without it and with the others a minute off.
     """
     own, alone = heard_in(scene), heard_in(unspoken(scene))
     at = np.minimum(np.arange(frames), len(own) - 1)
@@ -306,7 +308,7 @@ def annotated(scene: Scene, frames: int) -> tuple[Doubles, Doubles, Doubles]:
 
 
 def delayed(hazards_hz: dict[str, Doubles]) -> dict[str, Doubles]:
-    """Return hazards one frame late. A head gets its voice a frame early, which would reveal its own "mm-hm"."""
+    """Return hazards one frame late: a head gets its own voice a frame early, which would reveal its "mm-hm"."""
     return {kind: np.concatenate([values[:1], values[:-1]]) for kind, values in hazards_hz.items()}
 
 
@@ -324,7 +326,7 @@ class ReferenceHazard:
         return cls(teach(taught, "nod", STUDY), teach(map(muted, taught), "nod", _SILENT))
 
     def scores(self, person: MeetingPerson, frames: int) -> tuple[Doubles, Doubles, Doubles]:
-        """Return (frames,) each: with the own speech, without it, and without it while the others are a minute off."""
+        """Return (frames,) each: with the own speech, without it, and without it and with the others a minute off."""
         one = student(person, np.random.default_rng(0))
         heard, alone = one.evidence, muted(one).evidence
         other = alone.copy()
@@ -334,7 +336,7 @@ class ReferenceHazard:
             self.silent.log_odds(inputs(alone, _SILENT)),
             self.silent.log_odds(inputs(other, _SILENT)),
         )
-        # (M,) known as each step begins -> (frames,) known as each frame is over
+        # (M,) known at the beginning of each step -> (frames,) known at the end of each frame
         at = ((np.arange(frames) + 1) // STEP_FRAMES).clip(0, len(heard) - 1)
         speaking, silent, shifted = (np.asarray(steps[at]) for steps in by_step)
         return speaking, silent, shifted

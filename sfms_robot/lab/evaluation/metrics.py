@@ -1,7 +1,8 @@
-"""Metrics under the names their papers use, as their reference code computes them, in float64.
+"""Metrics with the names of their papers, computed as in their reference code, in float64.
 
-N clips or contexts, K samples of each, T frames, D channels. Predecessors disagree under the same names, so the
-definition is part of the name or said where it is made. FRRea, a distance between rendered images, is out of scope.
+N clips or contexts, K samples of each, T frames, D channels. Earlier work uses the same names for different
+definitions, so the definition is part of the name or stated at the function. FRRea, a distance between rendered images,
+is out of scope.
 
 The Learning2Listen line: clips are (N, T, D), or (T, D) for one, of equal shapes. Sources:
 Boese0601/Dyadic-Interaction-Modeling @ 9fc92f72 (DIM), sanjayss34/lm-listener @ 53ce4ecc, evonneng/learning2listen @
@@ -36,11 +37,11 @@ PARTS: Final = {
     "deca56": {"expression": slice(0, 50), "rotation": slice(50, 53)},
 }
 CLUSTERS: Final = {"expression": 15, "rotation": 9}
-NEEDED_FRAMES: Final = {1: 2, 2: 51}  # FRSyn looks 49 frames either way
-_ATTRIBUTE_GROUPS: Final = ((slice(0, 15), 15.0), (slice(15, 17), 1.0), (slice(17, 25), 8.0))  # DTW is divided by
+NEEDED_FRAMES: Final = {1: 2, 2: 51}  # by table; FRSyn has lags of up to 49 frames in both directions
+_ATTRIBUTE_GROUPS: Final = ((slice(0, 15), 15.0), (slice(15, 17), 1.0), (slice(17, 25), 8.0))  # divisor of the DTW
 _SID_EPS: Final = 1e-6  # inside the logarithm, as in DIM
 _STS_DT: Final = 0.1
-_KMEANS_ROUNDS: Final = 100  # scipy's 10 stop well before the centres do
+_KMEANS_ROUNDS: Final = 100  # scipy's default of 10 ends well before the centres stop moving
 _MAX_LAG: Final = 49  # two seconds at 25 fps, less one frame
 _CCC_EPS: Final = 1e-8
 _log = logging.getLogger(__name__)
@@ -65,7 +66,7 @@ def cut(motions: Sequence[Doubles] | Sequence[Floats], frames: int) -> Doubles:
 def frechet_distance(a: Doubles, b: Doubles) -> float:
     """Return FD of all frames of two sets of clips: |mu|^2 + tr(Sa) + tr(Sb) - 2 tr sqrt(Sa Sb), covariances ddof 1.
 
-    The root is taken through symmetric eigenvalues, which stays real. Fewer frames than channels make a covariance
+    The root is computed from symmetric eigenvalues, so it stays real. Fewer frames than channels make a covariance
     singular, which is logged.
     """
     x, y = (one.reshape(-1, one.shape[-1]) for one in (a, b))
@@ -80,7 +81,7 @@ def frechet_distance(a: Doubles, b: Doubles) -> float:
 
 
 def paired_frechet_distance(target: Doubles, pred: Doubles, speaker: Doubles) -> float:
-    """Return P-FD: FD of frames that hold speaker and listener side by side."""
+    """Return P-FD: FD of frames with the channels of both speaker and listener."""
     truth, guess = (np.concatenate([speaker, one], axis=-1) for one in (target, pred))
     return frechet_distance(truth, guess)
 
@@ -96,10 +97,10 @@ def mse(target: Doubles, pred: Doubles) -> float:
 
 
 def variance(x: Doubles, definition: Literal["flat", "time", "sum"] = "flat") -> float:
-    """Return one of three numbers of one name.
+    """Return the variance by one of three definitions.
 
     "flat" pools clips, frames and channels (DIM); "time" is the variance over time per channel and clip, averaged
-    (lm-listener); "sum" adds the pooled variances of the channels (DIM's other one).
+    (lm-listener); "sum" adds the pooled variances of the channels (DIM's other definition).
     """
     if definition == "flat":
         return float(x.var())
@@ -109,7 +110,7 @@ def variance(x: Doubles, definition: Literal["flat", "time", "sum"] = "flat") ->
 def shannon_index(pred: Doubles, centres: Doubles, unit: Literal["nats", "bits"] = "nats") -> float:
     """Return SI: the entropy of the clusters (`cluster_centres` (k, D)) that the predicted frames fall into.
 
-    Centres of another k-means differ, so numbers compare only with the same centres.
+    Centres of another k-means differ, so numbers can be compared only if their centres are the same.
     """
     labels, _ = vq(pred.reshape(-1, pred.shape[-1]), centres)
     share = np.bincount(labels) / len(labels)
@@ -262,15 +263,15 @@ def mean_known(values: Doubles) -> float:
 def synchrony_lags(pred: Doubles, speaker: Doubles, as_challenge: bool) -> Doubles:
     """Return the |lag| in frames, up to 49, at which each prediction (N, K) and the speaker correlate best.
 
-    As in the challenge only sample 0 counts, and one constant channel makes every lag NaN, which argmax answers with
-    the first: |lag| = 49. Otherwise all samples count without their constant channels, NaN if no channel is left: that
-    is the number to trust.
+    As in the challenge only sample 0 counts, and one constant channel makes every correlation NaN, so that argmax
+    returns the first lag: |lag| = 49. Otherwise all samples count without their constant channels, NaN if no channel is
+    left; this is the number to trust.
     """
     return np.stack([_best_lags(one, person, as_challenge) for one, person in zip(pred, speaker, strict=True)])
 
 
 def _best_lags(context: Doubles, speaker: Doubles, as_challenge: bool) -> Doubles:
-    """Return the |lag| of each of the samples (K, T, D) of one context, or of the first one."""
+    """Return the |lag| of each of the samples (K, T, D) of one context, or, if `as_challenge`, of the first sample."""
     samples, frames = context[:1] if as_challenge else context, len(speaker)
     curves = np.stack(
         [

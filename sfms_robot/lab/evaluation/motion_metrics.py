@@ -1,7 +1,7 @@
-"""`evaluate metrics`: the papers' metrics of any motion beside recorded motion, from files.
+"""`evaluate metrics`: the papers' metrics of any motion compared with recorded motion, from files.
 
-The prediction may come from another system: arrays and face tracks are scored by the same code as our tables.
-Predecessors disagree under the same names, so every row states its definition.
+The prediction may come from another system: arrays and face tracks are scored by the same code as our tables. Earlier
+work uses the same names for different definitions, so every row states its definition.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ ATTRIBUTES: Final = "attributes25"  # of the REACT challenge: 15 action units, v
 WIDTHS: Final = {"arkit58": 58, "faceverse58": 58, "deca56": 56, ATTRIBUTES: 25}
 _SPACES: Final = ", ".join(f"{channels} ({space})" for space, channels in WIDTHS.items())
 _TRACKS: Final = (".csv", ".csv.gz")
-_SHOWN: Final = 3  # names of a message
+_SHOWN: Final = 3  # names shown in a message
 
 
 @dataclass(frozen=True)
@@ -58,11 +58,11 @@ def evaluate_metrics(
 
     Args:
         truth: (T, D) or (N, T, D).
-        prediction: Also (N, K, T, D), K answers to every clip.
-        speaker: As truth; None: metrics that need it are left out.
-        space: A key of `WIDTHS`; None: by the number of channels, 58 being arkit58.
-        frames: Length of the clips; None: of the shortest.
-        seed: Of the intervals.
+        prediction: Like truth, or (N, K, T, D), K answers to every clip.
+        speaker: Like truth; None: metrics that need it are left out.
+        space: A key of `WIDTHS`; None: by the number of channels, where 58 means arkit58.
+        frames: Length of the clips; None: that of the shortest clip.
+        seed: Seed of the intervals.
 
     Raises ConfigError for files that do not match.
     """
@@ -123,7 +123,7 @@ def _read(
 
 
 def _clips(path: Path) -> dict[str, Doubles]:
-    """Return clips by name: of an array by number, of a folder by the files' names without their endings."""
+    """Return clips by name: the number in an array, or the names of a folder's files without their endings."""
     if path.is_dir():
         tracks = sorted(file for file in path.iterdir() if file.name.endswith(_TRACKS))
         if not tracks:

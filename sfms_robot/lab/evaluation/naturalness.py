@@ -1,14 +1,14 @@
-"""`evaluate naturalness`: a listener's motion beside that of people whose motion it was never trained on.
+"""`evaluate naturalness`: a listener's motion compared with that of people on whose motion it was never trained.
 
 Besides statistics of movement and drift, a small network tries to distinguish the two: a classifier two-sample test
-(Lopez-Paz and Oquab 2017). Both motions are cut into windows of two seconds, by region of the face, after the same 6
-Hz low-pass and with the noise of a face tracker, so that motion is judged, not rounding or a missing tremor. A network
-of three convolutions learns on the windows of most dyads and scores those of the others, in folds by dyad: a dyad
-is on one side alone, while a person or a voice may be on both, since a part has few of them. The area under its ROC
-curve is 0.5 for indistinguishable motions, 1 for always distinguishable ones.
+(Lopez-Paz and Oquab 2017). Both motions are cut into windows of two seconds, by region of the face, after the same 6 Hz
+low-pass and with the noise of a face tracker, so that motion is judged, not rounding or a missing tremor. A network of
+three convolutions learns on the windows of most dyads and scores those of the others, in folds by dyad. Each dyad is
+only on one side, while a person or a voice may be on both, since a split has few of them. The area under its ROC curve
+is 0.5 for indistinguishable motions, 1 for always distinguishable ones.
 
-Network, windows, noise and seeds are fixed: figures are comparable between versions, and nothing here may ever become a
-training loss.
+Network, windows, noise and seeds are fixed, so that figures are comparable between versions. Nothing here may ever
+become a training loss.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollo
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
 
-REGIONS: Final = {  # by the beginnings of their channels' names
+REGIONS: Final = {  # channels by the beginnings of their names
     region: [index for index, name in enumerate(CHANNELS) if name.startswith(names)]
     for region, names in {
         "head": POSE_CHANNELS,
@@ -53,7 +53,7 @@ ByDyad = Sequence[Floats]  # motion of each dyad, or windows of it
 FOLDS: Final = 5
 WINDOW: Final = 2 * FRAME_HZ
 _LOW_PASS_HZ: Final = 6.0
-_NOISE: Final = np.array([np.deg2rad(0.15)] * 3 + [0.0005] * 3 + [0.02] * 52)  # rad, m, of full closure
+_NOISE: Final = np.array([np.deg2rad(0.15)] * 3 + [0.0005] * 3 + [0.02] * 52)  # rad, m, fraction of full closure
 _STEPS: Final = 240
 _BATCH: Final = 64
 _WIDTH: Final = 24
@@ -69,8 +69,7 @@ def evaluate_naturalness(
 ) -> Figures:
     """Roll a listener out over the dyads of `split`, and compare its motion with that of their listeners.
 
-    Raises ConfigError for fewer than ten dyads, and for people of training. Blocks for minutes and
-    shows its progress.
+    Raises ConfigError for fewer than ten dyads, and for people of training. Blocks for minutes and shows its progress.
     """
     one_thread()
     if split == "train":
@@ -82,14 +81,14 @@ def evaluate_naturalness(
     heard = [frames_of_dyad(dyad) for dyad in dyads]
     listened = enumerate(tracked(heard, f"{name} listens"))
     ours = [rollout(listener, speaker, [seed + number]).motion[0] for number, speaker in listened]
-    # One stream hears one person after another.
+    # The input of one stream is one person after another.
     frames = islice(cycle(chain.from_iterable(heard)), round(drift_s * FRAME_HZ))
     timed = [changed(frame, time_s=number * FRAME_S) for number, frame in enumerate(frames, start=1)]
     long = rollout(listener, timed, [seed], title="a long run").motion[0]
     theirs, training = [dyad.listener for dyad in dyads], list[Floats]()
     if "train" in split_names(*detect(data, "auto")):
         some = [*streamable(data, "train", most=len(dyads))]
-        if len(some) == len(dyads):  # of as many listeners of the training split
+        if len(some) == len(dyads):  # the training split must have as many dyads
             training = listening(some, [dyad.listener for dyad in some])
     tests = two_samples(listening(dyads, ours), listening(dyads, theirs), training)
     addressed = [
@@ -113,7 +112,7 @@ def evaluate_naturalness(
 
 
 def notes(dyads: Sequence[Dyad], training: ByDyad) -> list[str]:
-    """Return what a reader of the figures has to know."""
+    """Return notes for a reader of the figures."""
     unknown = sum(dyad.attention is None for dyad in dyads)
     found = [f"the person's attention is unknown in {unknown} dyads: gaze counts all the time there"] if unknown else []
     return found if training else [*found, "too few dyads of training to compare its people with these"]
@@ -122,7 +121,7 @@ def notes(dyads: Sequence[Dyad], training: ByDyad) -> list[str]:
 def listening(dyads: Sequence[Dyad], motions: ByDyad) -> list[Floats]:
     """Return the windows (W, 50, 58) of each motion (N, 58) in which the dyad's listener is silent.
 
-    A mouth that talks is judged by its words (`evaluate interaction`).
+    A talking mouth is compared with its speech elsewhere (`evaluate interaction`).
     """
     rng, found = np.random.default_rng(0), []
     for motion, dyad in zip(motions, dyads, strict=True):
@@ -139,14 +138,14 @@ def compared(ours: Mapping[str, float], theirs: Mapping[str, float]) -> Figures:
 
 
 def nod_ratios(ours: Sequence[Doubles], theirs: Sequence[Doubles], chosen: Chosen) -> dict[str, float]:
-    """Return the medians of our nods in the motions at these places, as `nods_of` has them, over those of theirs."""
+    """Return the medians of our nods (rows of `nods_of`) in the motions `chosen`, over the medians of theirs."""
     drawn, recorded = (np.concatenate([nods[place] for place in chosen]).T for nods in (ours, theirs))
     figures = zip(("amplitude", "length", "cycle"), drawn, recorded, strict=False)
     return {f"nod_{name}_ratio": middle(a) / middle(b) for name, a, b in figures}
 
 
 def drifted(motion: Floats, theirs: ByDyad) -> Figures:
-    """Return how far the head is from the middle at the end of a long run, and outside people's 1 to 99 %."""
+    """Return the head's distance from the middle, and from people's 1 to 99 %, at the end of a long run."""
     end = np.median(slow_poses_deg([motion])[-6:], axis=0)
     low, high = np.percentile(slow_poses_deg(theirs), [1, 99], axis=0)
     outside = np.maximum(np.maximum(low - end, end - high), 0.0)
@@ -164,8 +163,9 @@ def two_samples(ours: ByDyad, theirs: ByDyad, training: ByDyad) -> Figures:
     """Return by region `two_sample_auc` of windows by dyad, each with its interval over dyads, and tests for scale.
 
     For scale: people against other people of the same split and, if `training` is given, people of training against
-    them: a perfect imitation of training could be distinguished as often. `imitated_two_sample_auc`: ours
-    against people of training. `levelled_`: each motion standardised by its own mean and deviation.
+    people of this split, since a perfect imitation of training could be distinguished as often.
+    `imitated_two_sample_auc`: ours against people of training. `levelled_`: each motion standardised by its own mean
+    and deviation.
     """
     half = 2 * (len(theirs) // 2)
     pairs: dict[str, tuple[ByDyad, ByDyad]] = {
@@ -187,7 +187,7 @@ def two_samples(ours: ByDyad, theirs: ByDyad, training: ByDyad) -> Figures:
 def windows(motion: Floats, rng: np.random.Generator, judged: Bools | None = None) -> Floats:
     """Return consecutive windows (W, 50, 58) of motion (N, 58), low-passed, with a tracker's noise.
 
-    With `judged` (N,) only windows of such frames. A motion shorter than a window gives none.
+    With `judged` (N,), only windows in which all frames are judged. A motion shorter than a window has none.
     """
     if len(motion) < WINDOW:
         return np.zeros((0, WINDOW, motion.shape[1]), np.float32)
@@ -212,8 +212,8 @@ def levelled(part: Floats) -> Floats:
 def separability(ours: ByDyad, theirs: ByDyad, region: str) -> tuple[float, float, float]:
     """Return the area under the ROC curve and its 95 % interval over dyads, of windows (W, 50, 58) by dyad.
 
-    Dyad d of both is the same dyad, or at least not a person of another one. Raises ValueError for fewer dyads than
-    folds.
+    Entry d of both is the same dyad, or at least shares no person with another entry. Raises ValueError for fewer dyads
+    than folds.
     """
     if len(ours) != len(theirs) or len(ours) < FOLDS:
         raise ValueError(f"dyads: expected equally many, {FOLDS} or more, got {len(ours)} and {len(theirs)}")

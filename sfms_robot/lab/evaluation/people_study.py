@@ -1,15 +1,15 @@
 """`evaluate people`: a blind comparison of listeners by people: its clips, its answers, its table.
 
-A study is a folder: `study.json` describes what is compared, `clips/` holds each condition's motion to each voice under
-a name that does not reveal the condition, `answers.csv` gets a row per answer when it is given. Called again with the
-same arguments the command resumes the study.
+A study is a folder. `study.json` describes what is compared, `clips/` has each condition's motion to each voice under a
+name that does not reveal the condition, and `answers.csv` immediately gets a row for each given answer. If the command
+is called again with the same arguments, it resumes the study.
 
 A trial shows two clips of the same voice, left and right, and asks `QUESTIONS` about them. Each participant sees every
 pair of conditions with every voice once, in a random order and on random sides. For each pair the table has the share
 of the first among the choices, with the exact (Clopper and Pearson) interval and the binomial test against one half;
-for three and more conditions also Bradley and Terry's strengths s, by which i is chosen before j with a chance of
-1 / (1 + exp(s_j - s_i)). Their intervals draw people with replacement, since answers of one person are dependent; for
-one person there is none.
+for three and more conditions also Bradley and Terry's strengths s, by which i is chosen before j with a probability of
+1 / (1 + exp(s_j - s_i)). Their intervals draw people with replacement, since answers of one person are dependent; with
+one person they are left out.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ QUESTIONS: Final = {
 NEITHER: Final = "neither"
 RECORDED: Final = "recorded"
 _STUDY, _ANSWERS, _CLIPS = "study.json", "answers.csv", "clips"
-_WARM_UP: Final = 10 * FRAME_HZ  # frames heard before a clip begins: a listener remembers
-_HOPS: Final = 997  # between the seeds of voices
+_WARM_UP: Final = 10 * FRAME_HZ  # frames before the beginning of a clip, since a listener has memory
+_HOPS: Final = 997  # difference between the seeds of two voices
 _STEPS: Final = 200
 
 
@@ -107,7 +107,7 @@ class Study:
         return secrets.token_hex(6)
 
     def next(self, participant: str) -> Figures:
-        """Return the participant's next trial, clips without their conditions' names; or that all is answered."""
+        """Return counts of trials and the participant's next trial, if any, whose clips do not reveal conditions."""
         shown = self._trials(participant)
         done = {answer.trial for answer in self._answers if answer.participant == participant}
         left = [trial for trial in shown if trial.trial not in done]
@@ -131,7 +131,7 @@ class Study:
         if set(chosen) != set(QUESTIONS) or not set(chosen.values()) <= {"left", "right", NEITHER}:
             raise ConfigError(f"answers: {', '.join(QUESTIONS)} want left, right or {NEITHER} each")
         if any((answer.participant, answer.trial) == (participant, number) for answer in self._answers):
-            return  # sent twice on a bad connection
+            return  # the answer was sent twice on a bad connection
         sides = {"left": trial.left, "right": trial.right, NEITHER: NEITHER}
         rows = [
             Preference(participant=participant, question=question, chosen=sides[chosen[question]], **asdict(trial))
@@ -188,16 +188,16 @@ class _StudyVoice:
 def prepare(
     conditions: Sequence[str], data: Path | None, split: Split, *, voices: int, seconds: float, seed: int, folder: Path
 ) -> Study:
-    """Return the study in `folder`, made if it is missing. Blocks for minutes.
+    """Return the study in `folder`, and make it if it is missing. Blocks for minutes.
 
     Args:
         conditions: Listeners by name or folder, and RECORDED for the people of `data`.
         data: Composed dyads, or any data set with voices; None: bundled voices.
-        split: Part of them.
-        voices: How many; each condition hears every voice.
+        split: Split of the data.
+        voices: Number of voices; each condition listens to every voice.
         seconds: Length of a clip.
-        seed: Of the listeners and of the order of trials.
-        folder: Of the study.
+        seed: Seed of the listeners and of the order of trials.
+        folder: Folder of the study.
 
     Raises RobotError.
     """
@@ -226,7 +226,7 @@ def prepare(
             motion, length = each.recorded, len(each.audio) // FRAME_SAMPLES
             if listener is not None:
                 motion = rollout(listener, each.frames, [seed + _HOPS * number]).motion[0, -length:]
-            assert motion is not None  # `_weights` asks for data
+            assert motion is not None  # `_weights` requires data for recorded people
             motion.astype("<f4").tofile(clips / f"{clip_name(seed, condition, number)}.f32")
     for number, each in enumerate(heard):
         soundfile.write(clips / f"voice-{number}.wav", each.audio, AUDIO_HZ, subtype="PCM_16")
@@ -250,7 +250,7 @@ def _weights(conditions: Sequence[str], data: Path | None) -> dict[str, str]:
     for name in conditions:
         if name != RECORDED:
             folder = find("listeners", name, "config.yaml")
-            load_listener(folder)  # report its errors here
+            load_listener(folder)  # raises its errors here
             weights[name] = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
     return weights
 
@@ -325,7 +325,7 @@ def summary(answers: Sequence[Preference]) -> Figures:
         "conditions": conditions,
         "rows": [row for row in rows if row["answers"]],
         "bradley_terry": strengths,
-        "sides": {"left": left, "right": len(chosen) - left},  # far from even: people did not look
+        "sides": {"left": left, "right": len(chosen) - left},  # far from even if people did not look
     }
 
 

@@ -1,13 +1,13 @@
-"""`evaluate robustness`: events of a listener with unknown speakers, heard and seen well and badly.
+"""`evaluate robustness`: events of a listener with unknown speakers, whose sound and face are good or degraded.
 
 A speaker looks at the head all the time. Each is played as a voice, as a face, and as both, as recorded and degraded in
-one way at a time; the streams of a listener differ by their seeds alone. Counted are the events visible in its motion,
-and its decisions, which have to stay as frequent as people's. For events that only answer a speaker, a minute is one in
-which the speaker talks or stopped less than two seconds ago. Without evidence of speech (no microphone, a mouth that
-does not move) no answer is expected.
+one way at a time; the streams of a listener differ only by their seeds. The events visible in its motion and its
+decisions are counted, and have to stay as frequent as people's. Events that only answer a speaker are counted per
+minute in which the speaker talks or stopped less than two seconds ago. Without evidence of speech (no microphone, a
+mouth that does not move) no answer is expected.
 
-Smiles are returned (`returned_smiles`): all speakers kept from training smile four times a minute, or never, and what
-is decided for them is counted.
+Returned smiles (`returned_smiles`): all speakers kept out of training smile four times a minute, or never, and the
+decisions for them are counted.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ Degrade = Callable[[Floats, Rng], Floats]
 # Events per minute of people in conversation: nods of AMI's listeners, median person and speaker-rich meetings.
 RANGES: Final = {"nod": (3.0, 7.0), "blink": (10.0, 25.0), "smile": (0.5, 1.5)}
 _DISPERSION: Final = (0.7, 2.0)  # variance over mean of counts: 1 is Poisson's
-_NOISE_DB: Final = -10.0  # below speech
+_NOISE_DB: Final = -10.0  # relative to speech
 _RT60_S: Final = 0.6
 
 
@@ -81,13 +81,13 @@ def evaluate_robustness(
     seed: int,
     jobs: int | None,
 ) -> Figures:
-    """Return events per minute for every speaker in every condition, and their scatter over seeds, beside people's.
+    """Return events per minute for every speaker in every condition, their scatter over seeds, and people's figures.
 
     Raises ConfigError, also for voices that listeners were trained on, or ModelError.
     """
     if split == "train":
         raise ConfigError("--split train: listeners were trained on these voices; validation and test are others")
-    load_listener(name)  # report its errors here, not from a process
+    load_listener(name)  # raises its errors here, not in a process
     voices = voice_folders(data)
     everybody = unseen(voices, split)[:speakers]
     tasks = [(place, inputs, number) for place in range(len(everybody)) for inputs, number in cases()]
@@ -120,7 +120,7 @@ def evaluate_robustness(
 def _play(
     listener: str, voices: Folders, split: Split, minutes: float, seeds: range, task: tuple[int, Inputs, int]
 ) -> Figures:
-    """Play one speaker in one condition: places among the voices of `split`, and in `CONDITIONS`."""
+    """Play one speaker in one condition; `task`: place among the voices of `split`, inputs, place in `CONDITIONS`."""
     place, inputs, number = task
     speaker, condition = unseen(voices, split)[place], CONDITIONS[number]
     frames = heard_and_seen(speaker, inputs, condition, minutes, np.random.default_rng([seeds.start, place, number]))
@@ -173,9 +173,9 @@ def unseen(voices: Folders, split: Split = "test") -> tuple[UnseenSpeaker, ...]:
 
 @cache
 def _kept(voices: Folders, split: Split) -> tuple[UnseenSpeaker, ...]:
-    """Return the speakers of `unseen`; none where no voice is kept for the split.
+    """Return the speakers of `unseen`; empty if no voice is kept for the split.
 
-    The face has the speaker's own mouth if it was filmed, else another's that opens with the voice.
+    The face has the speaker's own mouth if it was filmed, else another person's mouth that opens with the voice.
     """
     motions = motions_of(split)
     kept = {voice.name: voice for voice in find_voices(voices) if split_of_voice(voice.name) == split}
@@ -198,8 +198,8 @@ class InputCondition:
     """One way in which a microphone or a camera is not ideal.
 
     Attributes:
-        voice, face: Change the samples and the motion.
-        attention: Number of frames -> (frames,); without it the speaker looks at the head all the time.
+        voice, face: Functions that change the samples and the motion.
+        attention: Number of frames -> (frames,); if None, the speaker looks at the head all the time.
         mouth_moves: The face still shows speech.
     """
 
@@ -300,7 +300,7 @@ CONDITIONS: Final = (
 
 
 def cases() -> Iterator[tuple[Inputs, int]]:
-    """Yield the inputs of a speaker, and the places of the conditions that change them or nothing at all."""
+    """Yield inputs of a speaker with the place of each condition that changes them or changes nothing at all."""
     inputs: Inputs
     for inputs in ("voice", "face", "both"):
         for number, how in enumerate(CONDITIONS):
@@ -327,17 +327,18 @@ def heard_and_seen(
 # --- smiles that are returned ---------------------------------------------------------------------------------------
 
 THEIR_SMILES_A_MINUTE: Final = 4
-ANSWER_S: Final = 1.5  # from the onset of their smile
+ANSWER_S: Final = 1.5  # longest time from the onset of the speaker's smile to an answer
 SHIFT_S: Final = 60.0
 LEAST_MINUTES: Final = 3.0
 
 
 def returned_smiles(voices: Folders, speakers: int | None, minutes: float, seeds: Sequence[int]) -> Figures:
-    """Return what is decided for speakers who smile four times a minute, and for the same ones who never smile.
+    """Return figures of the smiles decided for speakers who smile four times a minute, or who never smile.
 
-    `answered`: share of their smiles with one of the head's within 1.5 s; `shifted`: the same with theirs moved by a
-    minute; `difference` of both, with its interval over speakers and seeds. `never_smiles_per_minute`: the head's
-    smiles with speakers who never smile; `false_per_minute`: those that follow a smile seen in their talking mouths.
+    `answered`: share of the speakers' smiles that are followed by a smile of the head within 1.5 s; `shifted`: the same
+    with the speakers' smiles moved by a minute; `difference` of both, with its interval over speakers and seeds.
+    `never_smiles_per_minute`: the head's smiles if the same speakers never smile; `false_per_minute`: those that follow
+    a smile seen in a talking mouth.
     """
     people = [speaker for split in ("validation", "test") for speaker in _kept(voices, split)][:speakers]
     model, motions = EventModel.load(), motions_of("test")
@@ -381,7 +382,7 @@ def returned_smiles(voices: Folders, speakers: int | None, minutes: float, seeds
 
 
 def _share_followed(at_s: Doubles, begun_s: Doubles) -> float:
-    """Return the share of instants within `ANSWER_S` after which something begins; 0 of none."""
+    """Return the share of instants `at_s` with a beginning within `ANSWER_S` after them; 0 without instants."""
     if not len(at_s):
         return 0.0
     first = np.searchsorted(begun_s, at_s)

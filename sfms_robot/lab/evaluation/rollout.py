@@ -1,11 +1,11 @@
-"""The motion of a listener left to itself while it hears the speaker of a dyad.
+"""The motion of a listener in a free run, with the speaker of a dyad as its input.
 
-`rollout` goes frame by frame as `run` does, with any listener. `offline_rollout` does the same from arrays, for SFMS:
-the features of a dyad are computed once for all streams, and speaker and plans stay in the model's motion space, so
-that data in DECA or FaceVerse coefficients, with mel in place of a waveform, are answered in the same space. A test
-checks that both give the same motion.
+`rollout` steps any listener frame by frame, as `run` does. `offline_rollout` does the same from arrays, for SFMS: the
+features of a dyad are computed once for all streams, and speaker and plans stay in the model's motion space, so that
+data in DECA or FaceVerse coefficients, with mel in place of a waveform, are answered in the same space. A test checks
+that both return the same motion.
 
-A listener that follows events receives the given ones, each `LEAD_FRAMES` before it begins, as in a run.
+A listener that follows events receives the given events, each `LEAD_FRAMES` before it begins, as in a run.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def run_in_processes(
 ) -> list[_Result]:
     """Return `work` of every task in their order, computed in at most `jobs` processes; None: as many as cores.
 
-    Shows a progress bar. An exception of a task is raised here and ends the others. `work` is a module's function.
+    Shows a progress bar. An exception of a task is raised here, and tasks that have not begun are dropped. `work` is a
+    module's function.
     """
     workers = min(jobs or os.cpu_count() or 1, len(tasks))
     if workers <= 1:
@@ -96,11 +97,11 @@ def spread(items: Sequence[_Task], most: int | None) -> list[_Task]:
     return [items[int(index)] for index in np.linspace(0, len(items) - 1, most).round()]
 
 
-# --- what a listener hears ------------------------------------------------------------------------------------------
+# --- input of a listener --------------------------------------------------------------------------------------------
 
 
 def streamable(data: Path, split: str, order: Order | None = None, most: int | None = None) -> Iterator[Dyad]:
-    """Open a split, and yield its dyads as a listener is streamed through them: in arkit58, at 25 fps.
+    """Open a split, and yield its dyads as they are streamed to a listener: in arkit58, at 25 fps.
 
     At most `most` of them, spread over the set; those that cannot be read are left out (`usable`). `order`: see
     `open_dataset`. Raises ConfigError.
@@ -115,7 +116,7 @@ def speaker_frames(
     """Return sound (N * 640,) and face (N, 58) as a source does, with the agent's voice (N * 640,) one frame early.
 
     A face of NaN becomes None, and so does the attention (N,) of a frame without a face; an attention of NaN (unknown)
-    stays. Without any sound there is no microphone.
+    stays. If all sound is zero, the frames have no microphone.
     """
     heard = audio if audio is not None and audio.any() else NO_SOUND
     said = None if agent_audio is None else np.pad(agent_audio, (0, FRAME_SAMPLES))[FRAME_SAMPLES:]
@@ -142,11 +143,11 @@ def frames_of_dyad(dyad: Dyad, clip_frames: int = 1) -> list[SpeakerFrame]:
 
 @dataclass(frozen=True)
 class Rollout:
-    """S streams that heard the same N frames; each plan counts until the next one.
+    """S streams with the same N input frames; each plan counts until the next one.
 
     Attributes:
         motion: (S, N, 58) faces.
-        states: (S, N) int8 of the paper's seven conversational states, -1 before the first, and without states.
+        states: (S, N) int8 of the paper's seven conversational states; -1 before the first, and if there are none.
         events: The decisions of each stream; empty for listeners that decide none.
     """
 
@@ -156,7 +157,7 @@ class Rollout:
 
 
 def control_at(listener: Listener, events: Sequence[ListenerEvent], index: int) -> Floats | None:
-    """Return the control that `listener` receives with frame `index` of its life; None if it follows no events."""
+    """Return the control that `listener` receives with frame `index` of its stream; None if it follows no events."""
     past, ahead = getattr(listener, "control_frames", (0, 0))
     if not past + ahead:
         return None
@@ -174,7 +175,7 @@ def rollout(
 ) -> Rollout:
     """Play the listener to `speaker` once for every seed, all streams together if it can.
 
-    `events`: for a listener that follows events. `title`: of a bar; "": none.
+    `events`: Events for a listener that follows events. `title`: Title of a progress bar; "": no bar.
     """
     memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
     motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
@@ -212,7 +213,7 @@ def rollouts(listener: Listener, dyads: Iterable[Dyad], seed: int, clip_frames: 
 
 @dataclass(frozen=True)
 class OfflineRollout:
-    """S streams that heard one dyad of N frames: motion (S, N, C) in the model's space, tokens (S, N, G) behind it."""
+    """S streams with a dyad of N frames as input: motion (S, N, C) in the model's space, and its tokens (S, N, G)."""
 
     motion: Tensor
     tokens: Tensor
@@ -223,10 +224,10 @@ def offline_rollout(
 ) -> OfflineRollout:
     """Compute `rollout` from arrays, with the dyad's events for a listener that follows events.
 
-    `true_past`: each plan continues from what the dyad's listener did, not from what this one planned before; it needs
-    engine torch.
+    `true_past`: Each plan continues from the motion of the dyad's listener, not from earlier plans; this needs engine
+    torch.
 
-    Raises ConfigError when the dyad's space cannot become the listener's, or the dyad has no events.
+    Raises ConfigError if the dyad's space cannot become the listener's, or the dyad has no events.
     """
     past, ahead, streams = listener.settings.past_frames, listener.horizon, len(seeds)
     heard = frames_of(dyad, listener.space, listener.frontend, listener.settings)
@@ -248,7 +249,7 @@ def offline_rollout(
     shown = np.repeat(path[:, :1], frames + ahead + 1, axis=1)
     settled = np.array([past - 1])
     truth = _true_past(listener, heard.motion) if true_past else None
-    for now in range(0, frames, listener.hop):  # the newest frame heard
+    for now in range(0, frames, listener.hop):  # the newest input frame
         frames_passed = listener.hop if now else 1
         tokens, path = passed(tokens, path, frames_passed, listener.holds)
         asked = control_at(listener, dyad.events or (), now)
@@ -283,5 +284,5 @@ def _true_past(listener: SfmsListener, motion: Tensor) -> tuple[NDArray[Any], Fl
 
 
 def _led(rows: NDArray[Any], frames: int) -> NDArray[Any]:
-    """Return rows (N, ...) after `frames` rows of zeros."""
+    """Return rows (N, ...) with `frames` rows of zeros before them."""
     return np.concatenate([np.zeros((frames, *rows.shape[1:]), rows.dtype), rows])

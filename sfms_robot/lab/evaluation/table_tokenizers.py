@@ -69,7 +69,7 @@ class Stack(nn.Module):
 
 
 class Bottleneck(nn.Module):
-    """width -> a code -> width, one step of time at a time."""
+    """A map of each time step separately: width -> a code -> width."""
 
     def __init__(self, settings: config.Baseline) -> None:
         super().__init__()
@@ -111,7 +111,7 @@ class DenseTokenizer(nn.Module):
 
     @property
     def bits_per_window(self) -> float:
-        """Return the size of the codes of a window; their places are known."""
+        """Return the size of the codes of a window; their places are known and need no bits."""
         return self.settings.window_frames * math.log2(self.settings.codes)
 
     def encode(self, motion: Tensor) -> Tensor:
@@ -168,9 +168,9 @@ class GroupedTokenizer(DenseTokenizer):
 def baseline_loss(
     tokenizer: DenseTokenizer, motion: Tensor, commitment: float, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Return the squared error of the window plus the commitment of learned vectors, which move with a `generator`.
+    """Return the squared error of the window plus the commitment of learned vectors; a `generator` updates the vectors.
 
-    The papers' loss is L1 by parts; the tables compare the squared error, so all tokenizers learn that.
+    The papers' loss is L1 by parts; the tables compare the squared error, so all tokenizers learn the squared error.
     """
     latent = tokenizer.latent(motion)
     codebook = tokenizer.bottleneck.codebook
@@ -184,8 +184,8 @@ def baseline_loss(
 # --- one interface --------------------------------------------------------------------------------------------------
 
 _CHUNK: Final = 64  # windows at a time
-_FREE_PLACES: Final = ("static", "static_paper")  # the reader knows where these keyframes are
-# Smallest deviation that a channel is divided by: rad, m, of 0..1. Smaller motion is noise.
+_FREE_PLACES: Final = ("static", "static_paper")  # a decoder knows the places of these keyframes
+# Smallest deviation by which a channel is divided: rad, m, fraction of 0..1. Smaller motion is noise.
 _STILL: Final = [0.01] * 3 + [0.005] * 3 + [0.02] * 52
 
 
@@ -232,7 +232,7 @@ class TableModel(nn.Module):
     def restore(self, motion: Tensor, mask: Tensor | None = None, *, rounded: bool = True) -> Tensor:
         """Encode and decode standardised windows (W, T, C), with keyframes at a mask (W, T, G) if given.
 
-        Not `rounded`: from what the encoder says, before a code is chosen; of sparse tokenizers.
+        If not `rounded`, decode the encoder's output before a code is chosen; only for sparse tokenizers.
         """
         tokenizer = self.tokenizer
         if isinstance(tokenizer, DenseTokenizer):
@@ -248,13 +248,13 @@ class TableModel(nn.Module):
     def bits(self, strategy: Strategy | None = None, keyframes: Sequence[int] = ()) -> float:
         """Return the bits of a window: codes at fixed length, and the places of keyframes unless they are known.
 
-        `keyframes` of each group, where they are not those of the recipe.
+        `keyframes`: Their number for each group, if it is not that of the recipe.
         """
         settings = self.recipe.model
         if isinstance(self.tokenizer, DenseTokenizer):
             return self.tokenizer.bits_per_window
         assert isinstance(settings, config.Sfms)
-        free = (strategy or settings.placement) in _FREE_PLACES  # then there is one way to choose them
+        free = (strategy or settings.placement) in _FREE_PLACES  # then there is only one way to place them
         counts = zip(
             keyframes or self.tokenizer.keyframes, (group.codes for group in settings.groups.values()), strict=True
         )

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_GAIN: Final = 0.4  # of windows while learning (`amplified`): six minutes of faces are few
+_GAIN: Final = 0.4  # gain of windows while learning (`amplified`), since six minutes of faces are few
 _WATCHED: Final = (0.02, 0.3, 0.6)  # windows with a history, as shares of all by decreasing motion
 _HISTORY: Final = "history.json"
 _SNAPSHOTS_AT: Final = (0.0, 0.03, 0.1, 0.3, 1.0)  # shares of the steps
@@ -58,9 +58,9 @@ def train_all(
     jobs: int,
     again: bool,
 ) -> None:
-    """Train tokenizers and keep them in `out`; interrupted ones are resumed, or all trained again with `again`.
+    """Train tokenizers and keep them in `out`. An interrupted one is resumed; with `again` all are trained again.
 
-    `examples` (W, T, 58) are windows of which some get a history.
+    `examples` (W, T, 58) are windows; a history is recorded for some of them.
     """
     order = examples[..., SHAPES].var(1).mean(1).argsort(descending=True)
     watched = examples[order[[round(share * (len(order) - 1)) for share in _WATCHED]]]
@@ -116,7 +116,7 @@ def train(
 
 
 def _job(name: str, model: TableModel, motion: Tensor, lengths: Sequence[int]) -> Job:
-    """Return the job of the training loop. It holds nothing out: the tables compare the last weights."""
+    """Return the job of the training loop. It has no held-out data, since the tables compare the last weights."""
     recipe, tokenizer, phase = model.recipe, model.tokenizer, model.recipe.training
     standard, starts = model.standardise(motion.to(model.motion_mean.device)), first_frames(lengths, model.window)
     if isinstance(tokenizer, Tokenizer):
@@ -173,7 +173,7 @@ _SNAPSHOTS: Final = TypeAdapter(list[Snapshot])
 
 @torch.no_grad()
 def snapshots(tokenizer: Tokenizer | DenseTokenizer, watched: Tensor, step: int) -> list[Snapshot]:
-    """Return the scores of a tokenizer before a step, for windows (W, T, C) in our units, one busy group of each."""
+    """Return the scores before a step for standardised windows (W, T, C), of the group with the most motion in each."""
     if isinstance(tokenizer, DenseTokenizer) or tokenizer.score is None:
         return []
     # Keyframes by the scores alone, without the corrections of `sweeps`.
@@ -181,7 +181,7 @@ def snapshots(tokenizer: Tokenizer | DenseTokenizer, watched: Tensor, step: int)
     score = tokenizer.score
     if isinstance(score, ScoreNetwork):
         scores = torch.log_softmax(score(watched), dim=1)
-    else:  # of the first choice alone
+    else:  # scores of the first choice only
         track = tracks(watched, tokenizer.member, score.curves)
         w, t, _ = watched.shape
         counts = torch.tensor(tokenizer.keyframes).repeat(w)

@@ -1,14 +1,14 @@
-"""Figures of when a listener nods in meetings, beside the annotated nods of the people.
+"""Figures of the times of a listener's nods in meetings, compared with the annotated nods of the people.
 
-Three sources are distinguished: what people did (`people_`), what a listener decides (`decided_`), and what is visible
-in its motion (no prefix). All are counted alike: onsets per minute of a kind of time (`times_of`), intervals in
-listening time, and how well a score ranks the instants at which the person's events began above the other instants at
-which they might have (`ranked`). Every count is a sum over one meeting; sums are added per person (`per_person`) and
-made into figures.
+Three sources are distinguished: the events of people (`people_`), the decisions of a listener (`decided_`), and the
+events visible in its motion (no prefix). All are counted in the same way: onsets per minute of a kind of time
+(`times_of`), intervals in listening time, and how well a score ranks the instants at which the person's events began
+above the other instants at which they might have begun (`ranked`). Every count is a sum over one meeting; sums are
+added per person (`per_person`) and made into figures.
 
 The nod table is the simplest baseline of timing: a rate of nods by speech phase. A cell is the place in the talk of the
-others: in a phrase, by how long it has lasted, or in a silence, by how long; both by the length of the phrase before.
-Its rate is nods over minutes, drawn toward the mean where minutes are few.
+others: in a phrase or in a silence, by its duration so far and by the length of the phrase before. Its rate is nods
+over minutes, pulled toward the mean where minutes are few.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from sfms_robot.signals.events import MOTION_EVENTS
 
 ANNOTATED: Final = ("mm_hm", "laugh", "gaze_shift")  # besides nods
 _WITHIN_S: Final = 0.5  # a nod this close counts for an instant
-_LEAST: Final = 3  # events of a person in a meeting, to be ranked
+_LEAST: Final = 3  # fewer events of a person in a meeting are not ranked
 _INTERVALS_S: Final = np.geomspace(0.2, 1200, 400)  # edges of the histogram of intervals
 _SIZES_DEG: Final = np.arange(0, 40.1, 0.1)  # edges of the histogram of nods by size
 _LONG_SILENCE_S: Final = 2.0
-_STRETCH_S: Final = 48.0  # of listening, whose nods are counted for their variance over mean
+_STRETCH_S: Final = 48.0  # listening time in which nods are counted for their variance over mean
 _SPEECH_S: Final = (1.0, 2.0, 4.0, 8.0)  # edges of the cells of the nod table
 _SILENCE_S: Final = (0.4, 0.8, 1.2)
 _LAST_S: Final = (1.0, 3.0)
-_PRIOR_NODS: Final = 5.0  # at the mean rate, in every cell
+_PRIOR_NODS: Final = 5.0  # nods at the mean rate that are added to every cell
 CELLS: Final = (len(_SILENCE_S) + 1 + len(_SPEECH_S) + 1) * (len(_LAST_S) + 1)
 
 Runs = Sequence[Doubles]  # spans (K, 2) [s] of events, once for each seed
@@ -72,7 +72,7 @@ def times_of(one: ListenerMeeting) -> dict[str, Bools]:
 def nod_sums(who: str, one: ListenerMeeting, runs: Runs, within: Bools | None = None, per_seen: float = 1.0) -> Sums:
     """Return nods and minutes of every kind of time, and the histogram of intervals, in the played part.
 
-    `per_seen`: nods there are for each one counted (`detection.Calibration`).
+    `per_seen`: True nods for each counted nod (`detection.DetectorCalibration`).
     """
     played = np.ones(one.frames, bool) if within is None else within
     onsets = [np.round(nods[:, 0] * FRAME_HZ).astype(np.int64).clip(0, one.frames - 1) for nods in runs]
@@ -89,7 +89,7 @@ def nod_sums(who: str, one: ListenerMeeting, runs: Runs, within: Bools | None = 
 
 
 def intervals_s(onsets: Ints, listening: Bools) -> Doubles:
-    """Return the listening time from onset to onset (frames); onsets outside of it do not count."""
+    """Return the listening time [s] from onset to onset (frames); onsets outside of listening do not count."""
     clock_s = np.cumsum(listening) / FRAME_HZ
     return np.diff(clock_s[np.sort(onsets[listening[onsets]])])
 
@@ -97,7 +97,7 @@ def intervals_s(onsets: Ints, listening: Bools) -> Doubles:
 def scatter(onsets: Ints, listening: Bools) -> Doubles:
     """Return [stretches times variance, sum] of the counts in stretches of 48 s of listening; zeros for one or none.
 
-    Nods that trigger nods come in bouts and leave whole stretches empty: their ratio exceeds 1, which is Poisson's.
+    Nods that trigger nods come in bouts and leave whole stretches empty, so their ratio exceeds 1, Poisson's value.
     """
     frames = round(_STRETCH_S * FRAME_HZ)
     stretch = (np.cumsum(listening) - 1) // frames
@@ -109,14 +109,14 @@ def scatter(onsets: Ints, listening: Bools) -> Doubles:
 
 
 def _other_sums(who: str, one: ListenerMeeting, kind: str, runs: Runs) -> Sums:
-    """Return events of another kind than nods and minutes of listening; "mm-hm" begins where listening ends."""
+    """Return [events of a kind other than nods, minutes of listening]; "mm-hm" begins where listening ends."""
     begun = _pooled([frames_before(spans[:, 0], one.frames) for spans in runs])
     counts = [one.listening[begun].sum(), len(runs) * minutes_of(one.listening)]
     return {f"{who}{kind}s_per_minute": np.array(counts, np.float64)}
 
 
 def people_sums(one: ListenerMeeting, within: Bools) -> Sums:
-    """Return the sums of the person; the intervals also of the played part alone."""
+    """Return the sums of the person; the intervals also for the played part only."""
     sums = nod_sums("people_", one, [one.spans_s["nod"]])
     sums["played_intervals"] = nod_sums("", one, [one.spans_s["nod"]], within)["intervals"]
     for kind in ANNOTATED:
@@ -127,8 +127,8 @@ def people_sums(one: ListenerMeeting, within: Bools) -> Sums:
 def decided_sums(one: ListenerMeeting, streams: Sequence[Sequence[ListenerEvent]], own_voice: bool = False) -> Sums:
     """Return the sums of a listener's decisions, one stream per seed.
 
-    `own_voice`: it spoke when the person did. Shifting its nods by a minute would shift them against that voice too, so
-    their contingency on the others is left out.
+    `own_voice`: The listener spoke when the person did. Shifting its nods by a minute would shift them against that
+    voice too, so their contingency on the others is left out.
     """
     nods = [event_spans(decided, "nod") for decided in streams]
     sums = nod_sums("decided_", one, nods)
@@ -147,10 +147,10 @@ def motion_sums(
     calibration: DetectorCalibration,
     own_voice: bool = False,
 ) -> Sums:
-    """Return the sums of events detected in motion (S, N', 58), made of the meeting's frames from `first` on.
+    """Return the sums of events detected in motion (S, N', 58), made from the meeting's frames from `first` on.
 
-    Nods are corrected by the finder's calibration: its lateness, and the share that it misses. `own_voice`: see
-    `decided_sums`.
+    Nods are corrected by the detector's calibration: its lateness, and the share of nods that it misses. `own_voice`:
+    see `decided_sums`.
     """
     runs, frames = motions.shape[:2]
     played = np.zeros(one.frames, bool)
@@ -176,7 +176,7 @@ def motion_sums(
 
 
 def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Bools | None = None) -> Doubles:
-    """Return [AUC * K, K]: how scores (N,) rank the instants before K events above the others of `begins`.
+    """Return [AUC * K, K]: how scores (N,) rank the instants before K events above the other instants of `begins`.
 
     Zeros for fewer than three events, or a kind without annotation.
     """
@@ -194,7 +194,7 @@ def ranked(scores: Doubles, one: ListenerMeeting, kind: str = "nod", within: Boo
 def contingent(
     who: str, name: str, matched: Doubles, shifted: Sequence[Doubles], one: ListenerMeeting, within: Bools | None = None
 ) -> Sums:
-    """Return how scores (N,) rank the nods, the mean for scores that belong to other minutes, and the difference."""
+    """Return how scores (N,) rank the nods, the mean ranking by scores of other minutes, and the difference."""
     own = ranked(matched, one, "nod", within)
     other = np.zeros(2)
     if shifted:
@@ -204,7 +204,7 @@ def contingent(
 
 
 def hazard_sums(who: str, one: ListenerMeeting, speaking: Doubles, silent: Doubles, other: Doubles) -> Sums:
-    """Return how hazards (N,) rank the nods: with the own speech, without it, and without it and the others shifted."""
+    """Return how hazards (N,) rank the nods: with own speech, without it, without it and with the others shifted."""
     ranks = contingent(who, "nod_hazard_auc", silent, [other], one)
     return {
         f"{who}nod_hazard_auc_without_own_speech": ranks[f"{who}nod_hazard_auc"],
@@ -214,9 +214,9 @@ def hazard_sums(who: str, one: ListenerMeeting, speaking: Doubles, silent: Doubl
 
 
 def differences(sums: Sums) -> Sums:
-    """Return how much better each source of evidence ranks the same nods than the one it is compared with.
+    """Return how much better each source of evidence ranks the same nods than the source it is compared with.
 
-    The hazards given what annotators saw are compared with the reference, and those with less to go by with these.
+    Hazards from annotations are compared with the reference; hazards with less evidence are compared with the former.
     """
     return {
         f"{who}{name}_minus_{other}": sums[who + name] - sums[f"{other}_{name}"] * [1, 0]
@@ -229,8 +229,8 @@ def differences(sums: Sums) -> Sums:
 def nod_contingency(who: str, runs: Runs, one: ListenerMeeting, within: Bools) -> Sums:
     """Return `contingent` for the nods of a listener with its own history.
 
-    The score is the share of runs with a nod within 0.5 s. The history of a run is its own, so its behaviour while it
-    heard another minute is its behaviour at that time: its nods are shifted, by every whole minute of the played part.
+    The score is the share of runs with a nod within 0.5 s. A run has its own history, so its response to another minute
+    is its behaviour at that time. Its nods are therefore shifted, by every whole minute of the played part.
     """
     played = np.flatnonzero(within)
     share = np.mean([phrase_timing.near(nods, one.frames, _WITHIN_S) for nods in runs], axis=0)
@@ -254,7 +254,7 @@ def cells(times_s: Doubles) -> Ints:
 
 
 def table_rates(people: Sequence[MeetingPerson]) -> Doubles:
-    """Return nods per minute (CELLS,) over the annotated time of all people, each cell with five more at the mean."""
+    """Return nods per minute (CELLS,) over the annotated time of all people, with five nods at the mean rate added."""
     nods, minutes = np.zeros((2, CELLS))
     for person in people:
         whole = Stretch(person=person, start_s=0.0, end_s=person.until_s)
@@ -273,7 +273,7 @@ def table_rates(people: Sequence[MeetingPerson]) -> Doubles:
 def per_person(meetings: Iterable[tuple[str, Sums]]) -> list[Sums]:
     """Return the sums of each participant from (participant, sums of a meeting).
 
-    An AUC becomes the mean over the person's events and counts once.
+    An AUC becomes the mean over the person's events, with weight 1.
     """
     by_name: dict[str, list[Sums]] = {}
     for participant, sums in meetings:

@@ -1,17 +1,17 @@
 """`evaluate tokenizer --table`: tables III and IV of the SFMS paper on any folder of faces, and figures 9 and 10.
 
-Two more tables say what the figures of those two come from: `3-placements` has every placement with the paper's
+Two more tables show the causes of the figures of those two: `3-placements` has every placement with the paper's
 inpainter and with ours, `4-codes` both kinds of code with the same dimensions, and without rounding. The rows of all
 are in `configs/tokenizer_tables.yaml`.
 
-A row is a tokenizer, perhaps with another placement of keyframes, beside the paper's figure. The paper's figures are of
-other motion (Learning2Listen, 56 FLAME coefficients), other training and unknown units: only how many times one row is
-better than another can be compared.
+A row is a tokenizer, perhaps with another placement of keyframes, with the paper's figure. The paper's figures are of
+other motion (Learning2Listen, 56 FLAME coefficients), other training and unknown units, so only ratios of rows can be
+compared.
 
 Figures 9 and 10 plot pairs of clusters before and after coding; here they become numbers. Windows are clustered by
-dynamic time warping, as in figure 10, around medoids as far from one another as possible ("highly distinctive"). For
-each tokenizer: is a coded window still nearer to its own medoid than to the next one (silhouette), and how far are the
-medoids from one another, relative to before (separation: below 1 they moved together)?
+dynamic time warping, as in figure 10, around medoids as far from one another as possible ("highly distinctive"). Each
+tokenizer has two figures. Silhouette: whether a coded window is still closer to its own medoid than to the next one.
+Separation: the distance of the medoids from one another, relative to before; below 1 they moved together.
 
 W windows of T frames and C channels, K clusters.
 """
@@ -73,9 +73,9 @@ class Spec:
     """A row before scoring.
 
     Attributes:
-        k: Keyframes of a window, where the row shows them.
-        placement: Where it differs from the tokenizer's.
-        rounded: Restored from codes; else from what they were chosen by.
+        k: Keyframes of a window, if the row shows them.
+        placement: Placement of keyframes, if it differs from the tokenizer's.
+        rounded: True: restored from codes; False: from the values before a code was chosen.
         paper_e2: The paper's MSE, times 100.
     """
 
@@ -103,7 +103,7 @@ def build(
 ) -> tuple[Figures, dict[str, Doubles]]:
     """Score those tokenizers of a table that are present; return its JSON, and the errors (W,) of its rows by label.
 
-    With several seeds a row is that of the first, but its `mse` is the mean over all, and `mse_by_seed` has each.
+    With several seeds a row is that of the first seed, except that `mse` is the mean and `mse_by_seed` has all.
     """
     truth = _doubles(next(iter(models.values())).standardise(seen.motion))
     clusters = cluster(truth) if len(truth) >= 4 else None
@@ -118,7 +118,7 @@ def build(
             rows.append(row)
             errors[f"{spec.name}, {row['bits_per_window']:,.0f} bits"] = wrong
     wanted = {spec.name for spec in TABLES[name] if spec.tokenizer in COMPARED["shipped"]}
-    whole = name in PAPER_TABLES and wanted <= {row["name"] for row in rows}  # else ratios would lack some
+    whole = name in PAPER_TABLES and wanted <= {row["name"] for row in rows}  # else some ratios would lack a row
     table = {
         "table": int(name) if name in PAPER_TABLES else name,
         "rows": rows,
@@ -161,11 +161,11 @@ def _scored(spec: Spec, model: TableModel, seen: Windows, clusters: Clusters | N
 
 
 def placed(model: TableModel, motion: Tensor, mask: Tensor) -> dict[str, float]:
-    """Return how keyframes lie at a mask (W, T, G), and how far the scores of Algorithm 1 decide that.
+    """Return figures of the keyframes of a mask (W, T, G), and of the influence of Algorithm 1's scores on them.
 
-    keyframes: of a track of a window; neighbours: share of them with another one in the frame before or after;
-    score_deviation: of the scores of a window, beside Gumbel noise's 1.28; draw_overlap: share of the keyframes that
-    two masks drawn at the end of training have in common.
+    keyframes: number in a track of a window; neighbours: share of keyframes with another one in the frame before or
+    after; score_deviation: deviation of the scores of a window, where Gumbel noise has 1.28; draw_overlap: share of the
+    keyframes that two masks drawn at the end of training have in common.
     """
     key = mask > 0.5
     beside = torch.zeros_like(key)
@@ -188,9 +188,10 @@ def placed(model: TableModel, motion: Tensor, mask: Tensor) -> dict[str, float]:
 
 
 def claims(rows: Sequence[Figures]) -> list[Figures]:
-    """Return, by inpainter and k, the error of learned keyframes over that of even ones, and if the paper's word holds.
+    """Return, by inpainter and k, the error of learned over even keyframes, and the verdict on the paper's statement.
 
-    The paper states that learned ones have less. The interval of `verdict` is the range over three seeds or more.
+    The paper states that learned keyframes have less error. The interval of `verdict` is the range over three seeds or
+    more.
     """
     found = []
     mse = {(row["name"], row["note"], row["k"]): row.get("mse_by_seed", [row["mse"]]) for row in rows}
@@ -346,8 +347,8 @@ def evaluate_table(
         data: Face tracks to score on, all held out; None: the held-out takes of the bundled motion.
         models: Folder of trained tokenizers; None: those of the checkout, without the papers' as written.
         train: Train all of them again, not only the missing ones.
-        size: Of what is trained.
-        steps: Of training, in place of the size's.
+        size: Size of the trained tokenizers.
+        steps: Steps of training, in place of those of the size.
         seeds: Trainings of each tokenizer, with seeds from 1 on.
         only: Patterns of the names of tokenizers that are compared, with commas between them.
         jobs: Processes that train.
@@ -373,7 +374,7 @@ def evaluate_table(
         train_all(missing, folder, recorded["train"], examples, size=size, steps=steps, jobs=jobs, again=train)
     loaded = {name: load_tokenizer(folder / name) for name in wanted}
     first_name, first = next(iter(loaded.items()))
-    for name, model in loaded.items():  # errors in different units cannot stand in one table
+    for name, model in loaded.items():  # one table cannot have errors in different units
         if not torch.allclose(model.motion_std, first.motion_std, rtol=1e-2) or model.window != first.window:
             raise ConfigError(f"{folder}: {name} and {first_name} were trained on different motion: add --train")
     seen = Windows.of(held_out, first.window)

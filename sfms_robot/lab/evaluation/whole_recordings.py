@@ -1,9 +1,9 @@
-"""Evidence and hazards of whole recordings at once: what `EventModel.decide_each` draws step by step.
+"""Evidence and hazards of whole recordings at once, which `EventModel.decide_each` computes and draws step by step.
 
-`heard_in` and `done_at` give the rows that `evidence.hear` and `evidence.done` give frame by frame. Where a history is
-given nothing has to be decided, so every step is asked together (`hazards_in`). Where none is, `most_in` says how
-likely each kind can be at all, whatever was done: at a step whose draws all lie above that nothing can happen, and only
-the others have to be decided one after the other.
+`heard_in` and `done_at` return the rows that `evidence.hear` and `evidence.done` return frame by frame. With a given
+history nothing has to be decided, so all steps are computed together (`hazards_in`). Without a history, `most_in`
+returns the highest probability that each kind can have after any history. At a step whose draws are all above it no
+event can begin, and only the other steps have to be decided, one after the other.
 """
 
 from __future__ import annotations
@@ -79,9 +79,9 @@ from sfms_robot.signals.audio import energies_db
 from sfms_robot.signals.event_sizes import SWING_S
 from sfms_robot.signals.events import CORNERS
 
-_TOGETHER: Final = 1000  # steps: as much as stays in a cache
-_MOST_NODS: Final = 1 + COUNTED_S / SWING_S[0]  # in the time in which they are counted
-_MARGIN: Final = 1e-9  # of log-odds, for sums in another order
+_TOGETHER: Final = 1000  # steps that are computed at once: as many as stay in a cache
+_MOST_NODS: Final = 1 + COUNTED_S / SWING_S[0]  # most nods in the time in which they are counted
+_MARGIN: Final = 1e-9  # margin of log-odds for sums in another order
 
 
 # --- Evidence ---------------------------------------------------------------------------------------------------------
@@ -89,14 +89,14 @@ _MARGIN: Final = 1e-9  # of log-odds, for sums in another order
 
 @dataclass(frozen=True)
 class Scene:
-    """N frames of a conversation of P people, oneself the first.
+    """N frames of a conversation of P people; the first person is the listener.
 
     Attributes:
-        speaks: (N, P).
-        looks: (N, P) each looks at oneself (1) or not (0); NaN: unknown. The first column means nothing.
-        laughs: (N,) one of the others does.
-        nods: (N,) one of the others begins to.
-        smiles: (N,) how large the smile of one of the others is; 0: none.
+        speaks: (N, P) each person speaks.
+        looks: (N, P) each person looks at the listener (1) or not (0); NaN: unknown. The first column has no meaning.
+        laughs: (N,) one of the others laughs.
+        nods: (N,) one of the others begins to nod.
+        smiles: (N,) size of the smile of one of the others; 0: none.
     """
 
     speaks: Bools
@@ -143,7 +143,7 @@ def heard_in(scene: Scene) -> Doubles:
 
 
 def counts_in(scene: Scene) -> Bools:
-    """Return (N, P) whose look counts: of those who speak, else of the holder of the floor. Never one's own."""
+    """Return (N, P) whose look counts: others who speak, else the holder of the floor; never the listener itself."""
     others = scene.speaks.copy()
     others[:, MINE] = False
     holder, _ = _floor_in(scene.speaks)
@@ -154,16 +154,16 @@ def counts_in(scene: Scene) -> Bools:
 
 
 def unspoken(scene: Scene) -> Scene:
-    """Return the scene without one's own voice."""
+    """Return the scene without the listener's own voice."""
     speaks = scene.speaks.copy()
     speaks[:, MINE] = False
     return replace(scene, speaks=speaks)
 
 
 def one_voice(scene: Scene) -> Scene:
-    """Return the scene as one microphone and one camera have it.
+    """Return the scene as one microphone and one camera record it.
 
-    All others are one person, whose look is that of the one who counts, and who nods only while silent.
+    All others become one person, with the look of the person whose look counts, and with nods only while silent.
     """
     others = np.any(scene.speaks[:, 1:], axis=1)
     looks = np.fmax.reduce(np.where(counts_in(scene), scene.looks, np.nan), axis=1)
@@ -183,7 +183,7 @@ def _since(happens: Bools) -> Doubles:
 
 
 def _smiles_in(smiles: Doubles) -> dict[str, Doubles]:
-    """Return (N,) seconds since the newest smile began, and its size so far; breaks of a second are none."""
+    """Return (N,) seconds since the newest smile began, and its size so far; breaks of a second do not end a smile."""
     index, at = np.arange(len(smiles)), np.flatnonzero(smiles > 0)
     first = at[np.diff(at, prepend=-np.inf) > SMILES_APART]
     newest = np.searchsorted(first, index, side="right") - 1
@@ -194,7 +194,7 @@ def _smiles_in(smiles: Doubles) -> dict[str, Doubles]:
 
 
 def _floor_in(speaks: Bools) -> tuple[Ints, Ints]:
-    """Return the holder of the floor (N,), -1 for none yet, and since which frame."""
+    """Return the holder of the floor (N,), -1 for none yet, and the frame (N,) since which it is the holder."""
     frames, people = speaks.shape
     index = np.arange(frames)
     lengths = np.stack([phase.times(speaks[:, who])[:, 0] for who in range(people)], axis=1)
@@ -245,12 +245,12 @@ def _swings_in(values: Doubles) -> Doubles:
 
 
 def scene_in(speaker: Sequence[SpeakerFrame], addressed: Addressed = "sense") -> Scene:
-    """Return the scene that `sense` sees in a recording; `heard_in` makes its rows of that."""
+    """Return the scene that `sense` detects in a recording; `heard_in` makes the rows of evidence from it."""
     memory = SenseMemory(addressed=addressed)
     speaks, looks = np.zeros((len(speaker), 2), bool), np.full((len(speaker), 2), np.nan)
     nods, smiles, laughs, speaks[:, 1] = signs_in([frame.face for frame in speaker]).T
     nods, laughs = nods > 0, laughs > 0
-    first = next((index for index, frame in enumerate(speaker) if len(frame.audio)), len(speaker))  # deaf until then
+    first = next((index for index, frame in enumerate(speaker) if len(frame.audio)), len(speaker))  # no sound before
     speaks[first:, 1] = phase.hear(_levels_db([frame.audio for frame in speaker[first:]]))
     speaks[:, 0] = (
         _levels_db([frame.audio[:0] if frame.agent_audio is None else frame.agent_audio for frame in speaker])
@@ -277,7 +277,7 @@ def done_at(
 ) -> Doubles:
     """Return the rows (M, len(DONE)) at instants (M,) from spans (K, 2) by kind of `EVENT_KINDS`.
 
-    Kinds that are not there have never been. `aside` (K,): which of the gaze shifts go away from the person.
+    Kinds that are missing have no events. `aside` (K,): The gaze shift goes away from the person.
     """
     columns: dict[str, Doubles | float] = {name: np.full(len(now_s), np.inf) for name in DONE}
     for kind in ("nod", "laugh", "smile", "shake", "tilt", "brow_raise"):
@@ -298,7 +298,7 @@ def done_at(
 
 
 def _since_newest(spans: Doubles | None, now_s: Doubles, ends: bool = False) -> Doubles:
-    """Return (N,) seconds since the newest span that had begun, began or ended; inf before the first, 0 inside."""
+    """Return (N,) seconds since the newest begun span began or, with `ends`, ended; inf before the first, 0 inside."""
     if spans is None or not len(spans):
         return np.full(len(now_s), np.inf)
     newest = np.searchsorted(spans[:, 0], now_s - EPS_S) - 1
@@ -310,14 +310,14 @@ def _since_newest(spans: Doubles | None, now_s: Doubles, ends: bool = False) -> 
 
 
 def steps_in(frames: int) -> Ints:
-    """Return the frames, of so many, at whose end hazards are drawn."""
+    """Return those of `frames` frames at whose end hazards are drawn."""
     return np.arange(STEP_FRAMES - 1, frames, STEP_FRAMES)
 
 
 def hazards_in(
     model: EventModel, heard: Doubles, own: Sequence[ListenerEvent], calmness: Calmness
 ) -> dict[str, Doubles]:
-    """Return `EventMemory.hazards_hz` of every frame, (N,) by kind, of evidence (N, len(HEARD)) and events in order."""
+    """Return `EventMemory.hazards_hz` of all frames, (N,) by kind, from evidence (N, len(HEARD)) and ordered events."""
     steps = steps_in(len(heard))
     now_s = np.asarray((steps + 1) * FRAME_S, np.float64)
     spans_s = {kind: event_spans(own, kind) for kind in EVENT_KINDS}
@@ -340,9 +340,9 @@ def hazards_in(
 
 
 def most_in(model: EventModel, heard: Doubles, calmness: Calmness) -> Doubles:
-    """Return the greatest probability (M, kinds) of each kind, of evidence (M, len(HEARD)) of steps.
+    """Return the highest probability (M, kinds) of each kind after any history, from evidence (M, len(HEARD)) of steps.
 
-    Over all that the stream may have done before: each term is taken at its greatest knot.
+    Each term that depends on the stream's earlier events has the value of its highest knot.
     """
     nothing = np.full((len(heard), len(DONE)), np.nan)
     most = _chances(model, heard, nothing, calmness, _most_by_doing(model, calmness), _MARGIN)
@@ -360,7 +360,7 @@ def _chances(
     terms: Doubles | float = 0.0,
     odds: float = 0.0,
 ) -> Doubles:
-    """Return the probabilities (M, kinds) of evidence of the others and of own events; `terms` and `odds` are added."""
+    """Return the probabilities (M, kinds) from evidence of the others and own events; `terms` and `odds` are added."""
     found = []
     for rows in np.array_split(np.concatenate([heard, done], axis=1), len(heard) // _TOGETHER + 1):
         log_odds = model.bank.log_odds(model.bank.contributions(rows) + terms)
@@ -369,7 +369,7 @@ def _chances(
 
 
 def _most_by_doing(model: EventModel, calmness: Calmness) -> Doubles:
-    """Return (T,) the most that each term can add by events of before; 0 for terms of the others."""
+    """Return (T,) the largest contribution of each term from the stream's earlier events; 0 for terms of the others."""
     curves = [weight for hazard in model.tables.hazards.values() for weight in hazard.weights.values()]
     knots_s = sorted({knot for curve in curves if isinstance(curve, dict) for knot in curve})
     rows = np.full((len(knots_s) + 1, len(EVIDENCE)), np.nan)
@@ -390,7 +390,7 @@ def event_spans(events: Sequence[ListenerEvent], kind: str) -> Doubles:
 
 
 def _answers(kind: str, heard: Doubles) -> Bools:
-    """Return (M,) whether a kind may begin, by what the others do."""
+    """Return (M,): an event of the kind may begin, given the behaviour of the others."""
     if kind in ALWAYS:
         return np.ones(len(heard), bool)
     spoken = ~(np.isnan(heard[:, AT["phrase_s"]]) & np.isnan(heard[:, AT["last_phrase_s"]]))
@@ -416,7 +416,7 @@ def decisions(
         )
         frames = [*steps[(draws[:, model.draws] < most).any(axis=1)].tolist(), len(heard)]
         streams.append(_Decider(model.start(seed, calmness), frames))
-    while ahead := [stream for stream in streams if stream.frame < len(heard)]:  # each at a time of its own
+    while ahead := [stream for stream in streams if stream.frame < len(heard)]:  # each stream is at its own frame
         sensed = [Sensed(stream.frame, heard[stream.frame]) for stream in ahead]
         decided = model.decide_each(sensed, [stream.memory for stream in ahead])
         for stream, (events, memory) in zip(ahead, decided, strict=True):
@@ -425,10 +425,10 @@ def decisions(
 
 
 class _Decider:
-    """A stream that decides at the end of some frames, the last of which is beyond the end.
+    """A stream that decides at the end of some frames, the last of which is beyond the end of the recording.
 
     Attributes:
-        frame: The next one.
+        frame: The next frame at whose end it decides.
     """
 
     def __init__(self, memory: EventMemory, frames: Sequence[int]) -> None:
@@ -437,9 +437,9 @@ class _Decider:
         self.frame = self._drawn = next(self._frames)
 
     def take(self, events: Sequence[ListenerEvent], memory: EventMemory) -> None:
-        """Keep what was decided, and find the next frame: a look away ends at a step that nothing is drawn for."""
+        """Store the decisions, and find the next frame; a look away also ends at a step for which nothing is drawn."""
         self.events += events
-        newest = {event.kind: event for event in memory.done}  # of others than nods no more is asked for
+        newest = {event.kind: event for event in memory.done}  # of kinds other than nods only these are needed
         self.memory = changed(memory, done=tuple(e for e in memory.done if e.kind == "nod" or newest[e.kind] is e))
         step, look = self.frame + STEP_FRAMES, newest.get("gaze_shift")
         if self.frame == self._drawn:

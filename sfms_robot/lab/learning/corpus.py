@@ -1,8 +1,8 @@
 """Many dyads as a few long tensors, from which windows are cut without crossing from one dyad into the next.
 
-What a frame holds is the family's own: a dataclass of tensors (N, ...), see `learning.sfms.features` and
-`learning.arig.features`. Where one dyad ends and the next begins is known here alone, so every statistic that compares
-a frame with its neighbour asks `Corpus.steps`.
+Each family of listeners has its own frames: a dataclass of tensors (N, ...), see `learning.sfms.features` and
+`learning.arig.features`. Only this module has the borders between dyads, so every statistic that compares a frame with
+its neighbour uses `Corpus.steps`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ AnyTraining = config.Training | config.ArigTraining
 Frames = TypeVar("Frames", bound="DataclassInstance")
 
 GAZE = [CHANNEL_INDEX[name] for name in GAZE_CHANNELS]
-# Columns of control rows: an event other than a blink is under way.
+# Columns of control rows that are above 0 while an event other than a blink is under way.
 ACTIVE = [at for at, name in enumerate(COLUMNS) if name.endswith(".active") and name != "blink.active"]
 SOUND_SAMPLE = 20_000  # frames whose sound gives means and deviations
 LEAST_SOUND_SPREAD = 1e-3
@@ -61,8 +61,8 @@ class Corpus(Generic[Frames]):
     Attributes:
         frames: tensors (N, ...).
         lengths: frames of each dyad.
-        scenes: the kind of conversation each dyad is of.
-        staged: The frames lie on disk, and only windows of them go to this device. None: frames in memory.
+        scenes: the kind of conversation of each dyad.
+        staged: device to which windows are sent, if the frames lie on disk. None: frames in memory.
     """
 
     frames: Frames
@@ -96,14 +96,14 @@ class Corpus(Generic[Frames]):
         return {name: starts[torch.from_numpy(scene == name)] for name in dict.fromkeys(scene.tolist())}
 
     def cut(self, starts: Tensor, window: int) -> Frames:
-        """Return the windows (B, window, ...) at (B,) starts, on the device of `to`; the starts lie on the CPU."""
+        """Return the windows (B, window, ...) at (B,) starts, on the device set by `to`; the starts are on the CPU."""
         to = self.staged or self.begins.device
         if self.staged is None:
             starts = starts.to(to, non_blocking=True)
 
         def sent(part: Tensor) -> Tensor:
             found = windows(part, starts, window)
-            # Only from pinned memory is a window sent while the next one is read.
+            # Only from pinned memory can a window be sent while the next one is read.
             return (found.pin_memory() if found.device != to else found).to(to, non_blocking=True)
 
         return _each(self.frames, sent)
@@ -144,10 +144,10 @@ def gather(
 ) -> Corpus[Frames]:
     """Stack dyads, read one at a time; those shorter than a window are left out and counted.
 
-    With `run.scratch` they are stacked in its folder `split`: the first process of each machine stages them there, and
-    the others wait.
+    With `run.scratch` they are stacked on disk, in its folder `split`: the first process of each machine writes them
+    there, and the others wait.
 
-    Raises ConfigError when none is left, and whatever `frames_of` raises.
+    Raises ConfigError when no dyad is left, and the errors of `frames_of`.
     """
     folder = None if run.scratch is None else run.scratch / split
     if folder is not None and run.group.local_rank:
@@ -185,7 +185,7 @@ def gather(
 
 
 def first_frames(lengths: Sequence[int], window: int, hop: int = 1) -> Tensor:
-    """Return the first frames of the windows that lie in one dyad, dyads of these lengths one after another."""
+    """Return the first frames of the windows that lie within one of the dyads, which follow one another."""
     firsts, at = [torch.empty(0, dtype=torch.int64)], 0
     for length in lengths:
         firsts.append(torch.arange(at, max(at, at + length - window + 1), hop))
@@ -202,7 +202,7 @@ def windows(values: Tensor, starts: Tensor, length: int) -> Tensor:
 def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
     """Encode motion (N, D) of a dyad in the space, (N, C); rows that are not finite stay so.
 
-    Raises ConfigError for a dyad in a space that cannot be turned into the wanted one.
+    Raises ConfigError for a dyad in a space that cannot be converted to the wanted one.
     """
     if dyad.space == space.name:
         return torch.from_numpy(motion)
@@ -215,9 +215,9 @@ def in_space(dyad: Dyad, motion: Floats, space: MotionSpace) -> Tensor:
 
 
 def without_gaze(dyad: Dyad) -> Dyad:
-    """Return the dyad without its gaze, for listeners that get events (`config.ListenerSettings.events`): eyeLook* are
-    0, and the head's part of a gaze shift is removed from the pose, where it is known.
+    """Return the dyad without its gaze, for listeners with events (`config.ListenerSettings.events`).
 
+    eyeLook* are 0, and the head's part of a gaze shift is removed from the pose, where it is known.
     Raises ConfigError for motion in another space than ours.
     """
     if dyad.space != "arkit58":
@@ -232,10 +232,11 @@ def without_gaze(dyad: Dyad) -> Dyad:
 def shared_frames(
     dyad: Dyad, space: MotionSpace, settings: config.Sfms | config.Arig | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return what every family takes of a dyad of N frames.
+    """Return the tensors that every family of listeners uses of a dyad of N frames.
 
-    The speaker's face (N, C), 0 where unknown, and where it is known (N,); the listener's motion (N, C), its sway
-    (N, S), where that is not in the motion, and the control rows (N, K) of its events. S and K are 0 without.
+    They are the speaker's face (N, C), 0 where unknown, and a mask (N,) of where it is known; the listener's motion
+    (N, C), its sway (N, S), if that is not in the motion, and the control rows (N, K) of its events. Without sway or
+    events, S or K is 0.
 
     `settings`: of the listener; None: one without events and sway. Raises ConfigError for a motion space that cannot be
     converted, and for a listener with events where the dyad has none, or not at our rate.
@@ -266,7 +267,7 @@ def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tens
     Deviations are clipped to a visible range: a still channel's noise is not amplified,
     and small movements of a channel that also makes large ones (a turning head) still count.
     """
-    bounds = []  # of blendshapes, rotations [rad], places [m]
+    bounds = []  # least and largest deviation: blendshapes, rotations [rad], places [m]
     for name in channels:
         if name in BLENDSHAPES:
             bounds.append((0.04, 0.12))
@@ -283,7 +284,7 @@ def motion_scales(motion: Tensor, channels: Sequence[str]) -> tuple[Tensor, Tens
 def fit_sound(model: SfmsModel | ArigModel, *tracks: tuple[Tensor, Tensor]) -> None:
     """Set the means and deviations of the sound of tracks: sound (N, ..., A) where it is heard (N,).
 
-    A feature that hardly moves is not amplified. Without any sound the model's stay.
+    A feature that hardly varies is not amplified. Without any sound the model's values are unchanged.
     """
     at = [heard.nonzero()[:, 0] for _, heard in tracks]
     total = sum(map(len, at))
@@ -302,13 +303,13 @@ def fit_sound(model: SfmsModel | ArigModel, *tracks: tuple[Tensor, Tensor]) -> N
 # --- Frames on disk --------------------------------------------------------------------------------------------------
 #
 # The processes of a machine share the system's file cache; the first process writes. A folder with frames of an earlier
-# run is written again.
+# run is overwritten.
 
 _INDEX = "index.json"
 
 
 def _stage(frames: DataclassInstance, folder: Path, first: bool) -> None:
-    """Append the tensors (N, ...) of one dyad to the files of a folder; `first`: in place of what they hold."""
+    """Append the tensors (N, ...) of one dyad to the files of a folder; `first`: replace their content."""
     with _writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, tensor in vars(frames).items():
@@ -340,10 +341,10 @@ def _writing(folder: Path) -> Iterator[None]:
         raise ConfigError(f"--scratch: {folder} cannot be written: {error.strerror or error}") from error
 
 
-# --- Packs: all that a trainer reads of its data, in one file --------------------------------------------------------
+# --- Packs: all data that a trainer reads, in one file ---------------------------------------------------------------
 #
-# A safetensors file of tensors SPLIT.FIELD; its metadata have the version, what it was made for, and of each split the
-# lengths and scenes of its dyads, as JSON.
+# A safetensors file of tensors SPLIT.FIELD. Its metadata hold, as JSON, the version, the settings it was made for, and
+# of each split the lengths and scenes of its dyads.
 
 PACK_VERSION: Final = 1
 _MADE_FOR: Final = ("kind", "motion_space", "neutral", "metres_per_unit", "sound", "audio", "phase", "events", "sway")
@@ -357,7 +358,7 @@ def _made_for(settings: AnyTraining) -> Figures:
 
 
 def write_pack(file: Path, corpora: Mapping[str, Corpus[Any]], settings: AnyTraining) -> None:
-    """Write corpora by split to a file, in one move. Raises ConfigError."""
+    """Write corpora by split to a file, which is replaced in one move. Raises ConfigError."""
     tensors = {
         f"{split}.{name}": tensor.contiguous()
         for split, corpus in corpora.items()
@@ -374,7 +375,7 @@ def training_data(
     settings: AnyTraining,
     read: Callable[[str], Corpus[Frames]],
 ) -> dict[str, Corpus[Frames]]:
-    """Return the frames of train and validation: of the pack `data`, or as `read` returns a split of a folder.
+    """Return the frames of train and validation: from the pack `data`, or read by `read` from a folder.
 
     Raises ConfigError.
     """
@@ -404,18 +405,18 @@ def training_data(
 
 CUT_HZ: Final = 1.0
 HEAD_KINDS: Final = ("nod", "shake", "tilt")  # events that move the head
-MARGIN_FRAMES: Final = 2  # around an event that may still be it
-UNKNOWN: Final = 1e-4  # weight of a frame in which sway cannot be seen: below 0.1 Hz it still counts
-LONGEST: Final = 2048  # frames of a spectrum
-ROUNDS: Final = 8  # to choose between people and mirror images, at most
+MARGIN_FRAMES: Final = 2  # around an event that may still belong to it
+UNKNOWN: Final = 1e-4  # weight of a frame in which sway cannot be seen; below 0.1 Hz it still counts
+LONGEST: Final = 2048  # most frames of a spectrum
+ROUNDS: Final = 8  # most rounds of choosing between people and their mirror images
 
 
 def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
     """Return the slow part (N, S) of motion (N, S): below `CUT_HZ`, and smooth across the events that move the head.
 
-    Whittaker's smoother, the z with the least sum of w |x - z|^2 + mu |second difference of z|^2. Frames of a nod weigh
-    nothing: sway cannot be seen in them, a low-pass alone would take the mean of a nod for sway, and give the nod a
-    swing in the opposite direction before it begins.
+    Whittaker's smoother, the z with the least sum of w |x - z|^2 + mu |second difference of z|^2. Frames of a nod have
+    the small weight `UNKNOWN`, since sway cannot be seen in them: a low-pass alone would take the mean of a nod for
+    sway, and give the nod a swing in the opposite direction before it begins.
     """
     from scipy.linalg import solveh_banded
 
@@ -428,7 +429,7 @@ def slow_part(motion: Floats, events: Sequence[ListenerEvent]) -> Floats:
             first = int(np.floor(event.start_s * FRAME_HZ)) - MARGIN_FRAMES
             last = int(np.ceil(event.end_s * FRAME_HZ)) + MARGIN_FRAMES
             weight[max(0, first) : max(0, last)] = UNKNOWN
-    mu = (2 * np.sin(np.pi * CUT_HZ / FRAME_HZ)) ** -4.0  # half of it passes at the cut
+    mu = (2 * np.sin(np.pi * CUT_HZ / FRAME_HZ)) ** -4.0  # half of the motion passes at the cut
     bands = np.zeros((3, n))
     difference = (1.0, -2.0, 1.0)
     for a, left in enumerate(difference):
@@ -447,16 +448,16 @@ def fit_sway(model: SfmsModel | ArigModel, slow: Sequence[Tensor]) -> None:
 
 
 def sway_of(slow: Sequence[Tensor], lateral: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-    """Return mixtures (BANDS, S, S) of `draw_sway` and spread () of sizes, of slow motion (N, S) of people.
+    """Return mixtures (BANDS, S, S) of `draw_sway` and spread () of sizes, fitted to slow motion (N, S) of people.
 
-    Each person is scaled to the mean size before powers are taken; `spread` holds the sizes. Of a person and the mirror
-    image, with `lateral` channels inverted, the one nearer to the other people counts.
+    Each person is scaled to the mean size before powers are computed; `spread` is the deviation of the sizes. Of a
+    person and the mirror image, with `lateral` channels inverted, the one nearer to the other people is used.
     """
     tracks = [one.double() - one.double().mean(0) for one in slow if len(one) >= 2 * FRAME_HZ]
     if not tracks:
         raise ValueError("no motion of 2 s or more to fit sway on")
     sizes = torch.stack([track.square().mean(0).sqrt().clamp(min=1e-9).log() for track in tracks])  # (K, S)
-    common = (sizes - sizes.mean(0)).mean(1)  # of the whole head
+    common = (sizes - sizes.mean(0)).mean(1)  # size of the whole head's motion
     spread = common.std(correction=0)
     powers = torch.stack(
         [band_powers(track / one.exp()) * len(track) for track, one in zip(tracks, common, strict=True)]
@@ -473,11 +474,11 @@ def _one_side(powers: Tensor, lateral: Sequence[int]) -> Tensor:
     turned[list(lateral)] = -1
     mirror = turned[:, None] * turned
     size = powers.sum((0, 1)).diagonal().clamp(min=1e-30).sqrt()
-    alike = powers.sum(1) / size / size[:, None]  # (K, S, S), every channel as much as any other
+    alike = powers.sum(1) / size / size[:, None]  # (K, S, S), every channel with the same weight
     mirrored = torch.zeros(len(powers), 1, 1, dtype=torch.bool)
     for _ in range(ROUNDS):
         mean = torch.where(mirrored, alike * mirror, alike).sum(0)
-        likeness = (alike * mean * (1 - mirror)).sum((1, 2))  # of what a mirror changes, as each stands
+        likeness = (alike * mean * (1 - mirror)).sum((1, 2))  # of the entries that a mirror changes
         before, mirrored = mirrored, (likeness < 0)[:, None, None]
         if torch.equal(before, mirrored):
             break
@@ -485,7 +486,7 @@ def _one_side(powers: Tensor, lateral: Sequence[int]) -> Tensor:
 
 
 def band_powers(track: Tensor) -> Tensor:
-    """Return the co-spectrum (BANDS, S, S) of a track (N, S) by band of `BANDS_HZ`; slower parts count in the first."""
+    """Return the co-spectrum (BANDS, S, S) of a track (N, S) by band of `BANDS_HZ`; the first has slower parts too."""
     from scipy import signal
 
     length, values = min(len(track), LONGEST), track.T.numpy()

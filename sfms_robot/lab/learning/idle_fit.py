@@ -1,10 +1,10 @@
-"""Small motion of resting faces that a listener lacks, as `listeners.idle` draws it.
+"""Fit of the small motion of resting faces that a listener lacks; `listeners.idle` draws it.
 
-Both are cut into windows of two seconds in which nothing of the face is under way: no blink, no smile, no word. By band
-the covariance of people's channels less that of the listener's is what it lacks; its largest eigenvectors, region by
-region, are the patterns, and their powers by band the spectrum, less what such short windows show of other bands. The
-slowest band is the difference between windows, over all people. Where the listener and its patterns together
-rest, and where people do, are quantiles of all frames of these windows.
+Motion of people and of the listener is cut into windows of two seconds without an event of the face: no blink, smile or
+word. In each frequency band, the covariance of people's channels minus that of the listener's is what it lacks. The
+largest eigenvectors, region by region, are the patterns. Their powers by band are the spectrum, without the power that
+leaks from other bands in such short windows. The slowest band is the difference between windows, over all people. The
+rest positions of people, and of the listener with its patterns, are quantiles of all frames of these windows.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ REGIONS: Final = [  # rows of blendshapes: brows, lids, mouth
     np.array([at for at, name in enumerate(BLENDSHAPES) if name.startswith(begins)])
     for begins in (("brow",), ("eyeSquint", "eyeWide", "eyeBlink"), MOUTH)
 ]
-PATTERNS: Final = 4  # of each region, at most
-LEAST: Final = 0.001  # deviation of a pattern that is worth drawing, in every channel together
+PATTERNS: Final = 4  # most patterns of each region
+LEAST: Final = 0.001  # least deviation of a pattern, over all its channels, that is worth drawing
 AT: Final = (0.01, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 0.95, 0.99)  # quantiles
 _SOUND: Final = 1e-3
 # Band of every line of a window's spectrum.
@@ -43,7 +43,7 @@ _BAND: Final = np.searchsorted(IDLE_BANDS_HZ, np.fft.rfftfreq(WINDOW, 1 / FRAME_
 
 
 def resting(motion: Floats, events: Iterable[ListenerEvent], own_voice: Floats | None = None) -> Floats:
-    """Return the windows (W, 50, 52) at rest of a motion (N, 58), by its events and its own voice (N * 640,)."""
+    """Return the windows (W, 50, 52) of a motion (N, 58) without events of the face or own voice (N * 640,)."""
     still = np.ones(len(motion), bool)
     for event in events:
         if event.kind in FACE_KINDS:
@@ -59,9 +59,9 @@ def resting(motion: Floats, events: Iterable[ListenerEvent], own_voice: Floats |
 
 
 def fit_idle(theirs: Sequence[Floats], ours: Sequence[Floats]) -> IdleMotion:
-    """Return the idle motion that windows `ours` lack beside `theirs`, an array (W, 50, 52) per person.
+    """Return the idle motion that the windows `ours` lack compared with `theirs`.
 
-    Raises ValueError without any window.
+    Both have an array (W, 50, 52) per person. Raises ValueError if either has no window.
     """
     people, listener = ([one for one in faces if len(one)] for faces in (theirs, ours))
     if not people or not listener:
@@ -79,7 +79,7 @@ def fit_idle(theirs: Sequence[Floats], ours: Sequence[Floats]) -> IdleMotion:
             loading[rows] = np.sqrt(by_band.sum()) * pattern
             loadings.append(loading)
             amplitudes.append(np.sqrt(by_band / by_band.sum()))
-    # How much people move, of those seen for ten seconds or more.
+    # Size of each person's motion, for those with ten seconds or more of windows.
     sizes = [np.log(windows.std(axis=(0, 1)).mean() + 1e-9) for windows in people if len(windows) * 2 >= 10]
     idle = IdleMotion(
         np.array(loadings, np.float32).reshape(-1, len(BLENDSHAPES)),
@@ -92,9 +92,10 @@ def fit_idle(theirs: Sequence[Floats], ours: Sequence[Floats]) -> IdleMotion:
 
 
 def _quantiles(idle: IdleMotion, people: Sequence[Floats], listener: Sequence[Floats]) -> tuple[Floats, Floats]:
-    """Return quantiles (KNOTS, C) of the listener's windows with the motion they lack, and of people's.
+    """Return quantiles (KNOTS, C) of the listener's windows with the idle motion added, and of people's windows.
 
-    The channels of gaze stay. Neighbours of people's, from the middle on, are no further apart than a map may be steep.
+    The channels of gaze are unchanged. Steps between people's quantiles, counted from the middle one, are limited to
+    the steepest allowed map.
     """
     rng = np.random.default_rng(0)
     rest = np.concatenate(listener).reshape(-1, len(BLENDSHAPES)).astype(np.float64)
@@ -112,9 +113,9 @@ def _quantiles(idle: IdleMotion, people: Sequence[Floats], listener: Sequence[Fl
 
 
 def _leakage() -> Doubles:
-    """Return what `covariances` finds in each band (IDLE_BANDS, IDLE_BANDS), mean over windows, of power 1 in another.
+    """Return the mean power that `covariances` finds in each band (row) for power 1 in a band (column).
 
-    A line of a band is seen in others too, above all one that is slower than a window is long.
+    Shape (IDLE_BANDS, IDLE_BANDS). A frequency also shows in other bands, above all if its period exceeds the window.
     """
     edges = np.array(IDLE_BANDS_HZ)
     hz = edges[:-1] + (np.arange(64)[:, None] + 0.5) / 64 * np.diff(edges)  # (64, IDLE_BANDS)
@@ -129,7 +130,7 @@ def _leakage() -> Doubles:
 
 
 def covariances(faces: Sequence[Floats]) -> Doubles:
-    """Return (IDLE_BANDS, C, C) of windows (W, 50, C) of several people, the slowest about the mean of all of them."""
+    """Return covariances (IDLE_BANDS, C, C) of people's windows (W, 50, C); the slowest about their common mean."""
     windows = np.concatenate(faces)
     channels = windows.shape[-1]
     means = windows.mean(axis=1, dtype=np.float64)
@@ -143,16 +144,16 @@ def covariances(faces: Sequence[Floats]) -> Doubles:
     return found
 
 
-# --- Behind `train idle`: what a trained listener leaves out of the small motion of resting faces, into its folder
+# --- `train idle`: fit the small motion that a trained listener lacks at rest, and write it to its folder --------
 
-SHOWN: Final = 8  # channels that move most, in the figures
+SHOWN: Final = 8  # number of channels, those that move most, in the figures
 
 
 def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
     """Roll the listener out over `clips` training dyads with their events, and write the idle motion that it lacks.
 
-    The idle motion of an earlier run is left out. Raises ConfigError for a listener without events, data without them,
-    or faces that never rest. Blocks for about a minute.
+    Idle motion of an earlier run is not used. Raises ConfigError for a listener without events, data without events,
+    and faces that never rest. Blocks for about a minute.
     """
     one_thread()
     folder = find("listeners", name, "config.yaml")

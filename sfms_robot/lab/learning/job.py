@@ -1,15 +1,15 @@
-"""Values that travel between a trainer, the training loop `fit` and its watchers.
+"""Values that are passed between a trainer, the training loop `fit` and its watchers.
 
-A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `learning.training_loop.fit`:
+A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and passes it to `learning.training_loop.fit`:
 
     torch.manual_seed(settings.seed)                       # weights of a new model
     model = MyModel(settings.listener).to(run.device)
     job = Job(
-        name="mine",                                       # of the bar, the checkpoint file, the TensorBoard folder
+        name="mine",                                       # for the bar, the checkpoint file, the TensorBoard folder
         model=model,                                       # all of its state dict goes into checkpoints
         optimizers=[optimizer(model.parameters(), phase.learning_rate, phase.weight_decay)],
         loss_of=lambda step, generator, batch: ...,        # scalar loss on `batch` samples drawn with `generator`
-        held_out=lambda: ...,                              # loss or error to watch, the same data each time; or None
+        held_out=lambda: ...,                              # loss or error on the same data each time; or None
         frames_per_step=phase.batch * window,
         phase=phase,                                       # a config.Phase: steps, clipping, precision, patience, ...
         seed=settings.seed,
@@ -18,15 +18,15 @@ A trainer (SFMS phase 1, phase 2, any other) builds a `Job` and hands it to `lea
     outcome = fit(job, out, run)                           # the model now holds its best weights: save them
 
 Six duties make a resumed run bit-identical on a CPU:
- - `loss_of` draws every random number from the generator it is given (a CPU one), from `noise_of` it, which on a GPU
-   draws there, or from torch's global one (dropout); never from numpy, the clock or another generator;
- - on a GPU it makes the host wait for nothing: what is chosen is chosen on the CPU and sent, losses are read later;
- - it takes the number of samples that it is given: `phase.batch`, or the part of them that is a piece of a step
+ - `loss_of` draws every random number from the generator it is given (on the CPU), from `noise_of` that generator,
+   which draws on the GPU if there is one, or from torch's global one (dropout); never from numpy, the clock or another;
+ - on a GPU it never makes the host wait: choices are made on the CPU and sent, losses are read later;
+ - it uses the number of samples that it is given: `phase.batch`, or the part of them that is a piece of a step
    (see "Trainer's side" below), and its loss is their mean;
- - whatever else changes from step to step follows from `step` (an annealed temperature), not from an attribute;
- - `held_out` may draw what it likes (its draws leave no trace) but gives the same number for the same weights;
- - everything before `fit` follows from the settings and the data, and `identity` names them: plain JSON data, and a
-   checkpoint whose identity differs is refused by the key that differs.
+ - everything else that changes from step to step (an annealed temperature) depends on `step`, not on an attribute;
+ - `held_out` may draw random numbers (the state is restored), but returns the same number for the same weights;
+ - everything before `fit` depends on the settings and the data, and `identity` contains them as plain JSON data: a
+   checkpoint with another identity is refused, with an error that names the key that differs.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ from sfms_robot import config
 from sfms_robot.app.progress import PlainBar, TimeLeft, console, rich_bar
 from sfms_robot.errors import ConfigError, GroupError, first_line, optional
 
-PATIENCE = timedelta(minutes=30)  # a process looks at held-out data, or stages files, while others wait
+PATIENCE = timedelta(minutes=30)  # of processes that wait while another evaluates held-out data or stages files
 
 
 @dataclass(frozen=True)
 class ProcessGroup:
-    """This process among `size` that train together; `local_rank` among those on its machine."""
+    """This process, one of `size` that train together; `local_rank` is its number among those on its machine."""
 
     rank: int = 0
     size: int = 1
@@ -76,7 +76,7 @@ class ProcessGroup:
         return [float(each) / self.size for each in sums]
 
     def from_first(self, find: Callable[[], float]) -> float:
-        """Return what the first process finds; the others wait for it."""
+        """Return the result of `find` in the first process; the others wait for it."""
         if self.size == 1:
             return find()
         found = torch.tensor([find() if self.first else 0.0], dtype=torch.float64, device=_device())
@@ -90,10 +90,10 @@ class ProcessGroup:
 
     @contextmanager
     def talking(self) -> Iterator[None]:
-        """Run a part that talks to the other processes. Raises GroupError if one of them is gone."""
+        """Run a part that communicates with the other processes. Raises GroupError if one of them is gone."""
         try:
             yield
-        except RuntimeError as error:  # gloo and NCCL raise this and its children
+        except RuntimeError as error:  # gloo and NCCL raise this and its subclasses
             if self.size == 1 or isinstance(error, torch.cuda.OutOfMemoryError):
                 raise
             said = f"process {self.rank} of {self.size} has lost another one: {first_line(error)}"
@@ -115,7 +115,7 @@ def joined(device: torch.device) -> Iterator[ProcessGroup]:
         torch.cuda.set_device(device)
     with group.talking():
         store, _, _ = next(rendezvous("env://", timeout=PATIENCE))
-        # torchrun goes on with a store that holds addresses of the dead.
+        # After a restart, the store of torchrun still holds addresses of the processes that died.
         store = dist.PrefixStore(f"restart {group.restarts}", store)  # type: ignore[attr-defined]
         backend = "nccl" if device.type == "cuda" else "gloo"
         dist.init_process_group(backend, timeout=PATIENCE, world_size=size, rank=group.rank, store=store)
@@ -126,7 +126,7 @@ def joined(device: torch.device) -> Iterator[ProcessGroup]:
 
 
 def local_rank() -> int:
-    """Return the number of this process among those on its machine, which is that of its GPU."""
+    """Return the number of this process among those on its machine, which is also that of its GPU."""
     return _number("LOCAL_RANK", 0)
 
 
@@ -152,13 +152,13 @@ LossOf = Callable[[int, Generator, int], Tensor]
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """One phase of training; see the module's text.
+    """One phase of training; see the module docstring.
 
     Attributes:
         loss_of: (step from 0, CPU generator, samples) -> scalar loss. The model is in training mode, under autocast if
-            asked.
+            configured.
         held_out: error on held-out data, less is better. The model is in evaluation mode, gradients are off.
-        frames_per_step: motion frames a step learns from, for the speed that is shown.
+        frames_per_step: motion frames in a step, for the speed that is shown.
     """
 
     name: str
@@ -177,14 +177,14 @@ class Job:
 
 
 class OwnNoise(Generator):
-    """The generator of a GPU's own noise. Nothing of weight 0 is drawn from it.
+    """The generator of noise that is drawn on a GPU. Noise of weight 0 is not drawn from it.
 
-    From the run's generator, on a CPU, everything is drawn in one order whatever its weight: a run repeats bit for bit.
+    From the run's generator, on a CPU, all noise is drawn in one order, also with weight 0: a run repeats bit for bit.
     """
 
 
 def noise_of(generator: Generator, device: torch.device) -> Generator:
-    """Return what draws the noise of a step on `device`: a CPU's is the run's generator, a GPU's is seeded by it."""
+    """Return the generator of a step's noise on `device`: the run's own on a CPU, one seeded by it on a GPU."""
     if device.type == "cpu":
         return generator
     own = OwnNoise(device)
@@ -193,7 +193,7 @@ def noise_of(generator: Generator, device: torch.device) -> Generator:
 
 
 def uniform(generator: Generator, *shape: int) -> Tensor:
-    """Draw numbers of 0..1, on the generator's device."""
+    """Draw uniform numbers in 0..1, on the generator's device."""
     return torch.rand(shape, generator=generator, device=generator.device)
 
 
@@ -209,7 +209,7 @@ def is_drawn(generator: Generator, *weights: float) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Position:
-    """Where a run stands after `step` steps. `loss` is smoothed; `worse` counts looks since the best held-out loss."""
+    """State of a run after `step` steps. `loss` is smoothed; `worse` counts evaluations since the best."""
 
     step: int = 0
     loss: float | None = None
@@ -222,7 +222,7 @@ class Position:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Report to a watcher after every step. `position.held_out` is new when `looked`."""
+    """Report to a watcher after every step. `position.held_out` is new if `looked`."""
 
     name: str
     steps: int
@@ -241,12 +241,12 @@ class Run:
     Attributes:
         watches: called after every step.
         group: the processes that run it together.
-        accumulate: pieces of a step's batch that each process takes one after the other; None: as few as there can be.
+        accumulate: pieces of a step's batch that each process computes in turn; None: one, or on resuming as before.
             The number of pieces is part of a run's identity, their assignment to processes is not: a run can be
             resumed with any number of processes that can share its pieces.
         scratch: folder for frames that are read from disk as they are drawn; None: they are held in memory.
-        read_every: steps whose losses are read and reported together; None: one, and `READ_EVERY` on a GPU, where
-            reading makes the host wait.
+        read_every: steps whose losses are read and reported together; None: 1 on a CPU, `READ_EVERY` on a GPU,
+            where reading makes the host wait.
     """
 
     resume: bool = False
@@ -263,8 +263,9 @@ ALONE: Final = Run()  # one process, on the CPU, from the first step
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingOutcome:
-    """Result of a run. `loss` is smoothed and of the last step; `held_out` is of the weights that the model now
-    holds.
+    """Result of a run.
+
+    `loss` is smoothed and of the last step; `held_out` is of the weights that the model now holds.
     """
 
     loss: float
@@ -275,7 +276,7 @@ class TrainingOutcome:
     resumed_at: int | None
 
 
-# --- Watchers of a training run: a progress bar on stderr, and curves for TensorBoard. Nothing waits for them
+# --- Watchers of a training run: a progress bar on stderr, and curves for TensorBoard -----------------------
 
 Watch = Callable[[Report], None]
 CURVES_EVERY = 10  # steps
@@ -323,7 +324,7 @@ def tensorboard(folder: Path) -> Iterator[Watch]:
     def watch(report: Report) -> None:
         step = report.position.step
         if report.name not in writers:
-            # An interrupted run's curves past its checkpoint are drawn again.
+            # Curves of an interrupted run after its checkpoint are replaced.
             writers[report.name] = SummaryWriter(str(folder / report.name), purge_step=step)
         curves = {}
         if step % CURVES_EVERY == 0 or report.position.finished:

@@ -1,6 +1,6 @@
-"""Behind `train`: a configuration and a data folder in, weights and figures out, watched while it runs.
+"""Functions behind `train`: train with a configuration and a data folder, write weights, return figures.
 
-`train ... --dry-run`: one step of every stage of a training file, on made-up frames, and what all of it would take.
+`train ... --dry-run`: measure one step of every stage of a training file, on made-up frames, and estimate all steps.
 """
 
 from __future__ import annotations
@@ -76,12 +76,12 @@ DEVICES = ("auto", "cpu", "cuda")
 class TrainOptions:
     """Options of the command line.
 
-    `seed`, `steps`, `changes` of the listener and `phase_changes` of ARIG's training replace the file's; `tensorboard`
-    None: if installed. `order` is that of the channels in the data, if not its layout's own. `overwrite`: what an
-    earlier training left in `out` may be lost. `accumulate` and `scratch`: of `learning.job.Run`.
+    `seed`, `steps`, `changes` of the listener and `phase_changes` of ARIG's training replace values of the file.
+    `tensorboard` None: if installed. `order` is that of the channels in the data, if not its layout's own. `overwrite`:
+    files of an earlier training in `out` may be lost. `accumulate` and `scratch`: see `learning.job.Run`.
 
-    Several processes train together where `torchrun` starts them; those but the first return no figures. What torchrun
-    starts again after one of them died resumes from the checkpoint.
+    Several processes train together if `torchrun` starts them; only the first returns figures. Processes that torchrun
+    restarts after one of them died resume from the checkpoint.
     """
 
     file: Path
@@ -132,12 +132,12 @@ def train_listener(options: TrainOptions) -> Figures:
 
 
 def _told(figures: Figures, run: Run, began_s: float) -> Figures:
-    """Return the figures and the minutes they took, of the first process alone."""
+    """Return the figures and the minutes they took; {} in all processes except the first."""
     return {**figures, "minutes": round((time.monotonic() - began_s) / 60, 2)} if run.group.first else {}
 
 
 def pack_data(file: Path, data: Path, out: Path, order: Order | None = None) -> Figures:
-    """Write all that the training of a file reads of its data to `out`. Returns dyads, frames and bytes."""
+    """Write all data that training by a file reads to the pack `out`. Returns dyads, frames and bytes."""
     settings = load_training(file)
     found: Mapping[str, Corpus[Any]] = (
         arig_corpora(settings, data, ALONE)
@@ -160,7 +160,7 @@ def device_of(name: str) -> torch.device:
 
 
 def train_settings(options: TrainOptions, phase: str = "training") -> AnyTraining:
-    """Read the training file and apply the options; `phase` is the one whose steps they mean."""
+    """Read the training file and apply the options; `phase` is the one whose steps they set."""
     settings = load_training(options.file)
     raw = settings.model_dump(mode="json")
     if isinstance(settings, config.ArigTraining):
@@ -178,8 +178,8 @@ def train_settings(options: TrainOptions, phase: str = "training") -> AnyTrainin
 def run_of(options: TrainOptions, job: str, weights: str, *others: str) -> Iterator[Run]:
     """Yield the run of a job with the settings of the command line, and a progress bar.
 
-    What torchrun has started again resumes from its checkpoint. Raises ConfigError where files of an earlier training
-    of this job, or of `others`, would be replaced.
+    After a restart by torchrun it resumes from its checkpoint. Raises ConfigError if files of an earlier training of
+    this job, or of `others`, would be replaced.
     """
     device, kept = device_of(options.device), checkpoint_file(options.out, job)
     with ExitStack() as stack:
@@ -193,7 +193,7 @@ def run_of(options: TrainOptions, job: str, weights: str, *others: str) -> Itera
                 watches.append(stack.enter_context(tensorboard(options.out / "tensorboard")))
             watches.append(stack.enter_context(progress_bar()))
         if not (group.restarts or options.resume or options.overwrite):
-            group.wait()  # nothing has been written yet by any of them
+            group.wait()  # no process has written anything yet
             for file in (options.out / weights, kept, *(options.out / name for name in others)):
                 if file.exists():
                     raise ConfigError(
@@ -216,11 +216,11 @@ def run_of(options: TrainOptions, job: str, weights: str, *others: str) -> Itera
 # rarely, and looks restless or frozen. A bias on class 0 per group corrects that rate. For a listener with a fixed
 # course of nods and smiles, the course is the median of the data's.
 
-DYADS = 8  # that are rolled out
-COURSE_DYADS = 128  # for their nods and smiles, without roll-outs
-LEAST = 10  # of a kind, to know its course
+DYADS = 8  # dyads that are rolled out
+COURSE_DYADS = 128  # dyads whose nods and smiles are measured, without roll-outs
+LEAST = 10  # events of a kind that are needed to measure its course
 LARGEST_STEP = 1.0  # of a bias, per round
-STREAMS = 4  # of every dyad, side by side
+STREAMS = 4  # streams of every dyad, in parallel
 
 
 def calibrate(training: config.Training, data: Path, out: Path, order: Order | None = None) -> None:
@@ -247,7 +247,7 @@ def calibrate(training: config.Training, data: Path, out: Path, order: Order | N
 
 
 def _some(dyads: Dataset, window: int, count: int = DYADS) -> list[Dyad]:
-    """Return a few dyads, spread over a set, that are as long as a window; or else the first one that is."""
+    """Return a few dyads, spread over a set, that are as long as a window; or else the first dyad that is."""
     chosen = [*usable(dyads[:: max(1, len(dyads) // count)])][:count]
     long = [dyad for dyad in chosen if len(dyad.listener) >= window]
     return long or [next(dyad for dyad in usable(dyads) if len(dyad.listener) >= window)]
@@ -324,16 +324,16 @@ def _rates(tokens: Tensor) -> list[float]:
 
 # --- Behind `--dry-run` ---------------------------------------------------------------------------------------------
 #
-# Operations, bytes and calls are counted, not guessed: of a piece of the batch that is small enough for this machine,
-# forward and backward, as often as the batch has such pieces, and of the update of all weights. A GPU's time for a step
-# is then the longest of three: operations at a share of its peak, bytes at a share of its bandwidth, calls at what one
-# costs the processor that makes them. Random numbers are drawn on the GPU (`learning.job`): bytes and calls like
-# others. The shares are assumptions, told with the figures.
+# Operations, bytes and calls are counted, not guessed: forward and backward of a piece of the batch that is small
+# enough for this machine, times the number of such pieces, and the update of all weights. A GPU's time for a step
+# is then the longest of three: operations at a share of its peak, bytes at a share of its bandwidth, calls at the cost
+# of one for the processor that makes them. Random numbers are drawn on the GPU (`learning.job`), with bytes and calls
+# like others. The shares are assumptions and are reported with the figures.
 
-MOST_FRAMES: Final = 1200  # of a piece: what a small machine holds
-REACHED: Final = 0.3  # of a GPU's peak, and `STREAMED` of its bandwidth
-STREAMED: Final = 0.7
-CALL_US: Final = 8.0  # one call of torch from Python
+MOST_FRAMES: Final = 1200  # largest piece: fits a small machine
+REACHED: Final = 0.3  # share of a GPU's peak that is reached
+STREAMED: Final = 0.7  # share of its bandwidth
+CALL_US: Final = 8.0  # time of one call of torch from Python
 CPU: Final = torch.device("cpu")
 
 
@@ -360,7 +360,7 @@ ASSUMED: Final = (
 def dry_run(settings: AnyTraining) -> Figures:
     """Return figures of every stage, and hours of all their steps.
 
-    Blocks: up to minutes at the paper's sizes on a small machine, most of it backward passes.
+    Blocks for up to minutes at the paper's sizes on a small machine, most of it for backward passes.
     """
     stages = [_measured(job) for job in jobs_of(settings)]
     hours = {gpu: round(sum(stage["hours"][gpu] for stage in stages), 2) for gpu in GPUS}
@@ -390,7 +390,7 @@ def jobs_of(settings: AnyTraining) -> Iterator[Job]:
 
 
 def _made_up(frames: int, listener: config.Sfms | config.Arig) -> list[Dyad]:
-    """Make conversations of noise, in the listener's space, or where it has events in arkit58.
+    """Make conversations of noise, in the listener's space, or in arkit58 if it has events.
 
     The cost of a step does not depend on the content.
     """

@@ -31,8 +31,8 @@ from sfms_robot import config
 from sfms_robot.errors import ConfigError, GroupError, ModelError, first_line
 from sfms_robot.lab.learning.job import ALONE, Job, LossOf, Position, ProcessGroup, Report, Run, TrainingOutcome
 
-SMOOTHING = 0.98  # of the loss that is shown
-READ_EVERY = 10  # steps of a GPU whose losses are read together: reading one makes the host wait for it
+SMOOTHING = 0.98  # exponential, of the loss that is shown
+READ_EVERY = 10  # steps on a GPU whose losses are read together, since reading makes the host wait
 
 log = logging.getLogger(__name__)
 
@@ -48,24 +48,24 @@ def fit(job: Job, out: Path, run: Run = ALONE, clock: Callable[[], float] = time
     """Run `job` to its last step or until its patience ends; the model then holds its best weights.
 
     Checkpoints go to `out`/checkpoint-NAME.safetensors; `run.resume` continues from there, and a run that had finished
-    only restores its weights. Ctrl-C ends the step, writes a checkpoint and raises KeyboardInterrupt with a line for
-    the user; a second one stops at once. Raises ModelError as soon as a loss or a gradient is not finite: the last
-    checkpoint stays; and, with a checkpoint of the steps made so far, where a GPU has too little memory. On a GPU
-    losses are read, and reports made, every `READ_EVERY` steps. `clock` (s) decides when to write
-    checkpoints and how fast frames go, and no weights.
+    only restores its weights. Ctrl-C finishes the step, writes a checkpoint and raises KeyboardInterrupt with a line
+    for the user; a second one stops at once. Raises ModelError as soon as a loss or a gradient is not finite (the last
+    checkpoint stays), and if a GPU has too little memory (after writing a checkpoint of the steps made so far). On a
+    GPU losses are read, and reports made, every `READ_EVERY` steps. `clock` [s] determines the times of checkpoints and
+    the reported speed, but no weights.
 
-    Of a group of processes (`run.group`) all make the same steps; the first one looks at held-out data and writes. Then
-    it also raises GroupError when another process is gone, and ConfigError when they cannot share the batch.
+    In a group of processes (`run.group`) all make the same steps; the first evaluates held-out data and writes files.
+    There `fit` also raises GroupError if another process is gone, and ConfigError if they cannot share the batch.
     """
     file, phase = checkpoint_file(out, job.name), job.phase
     group, pieces = run.group, pieces_of(job, run, file)
     job = replace(job, identity={**job.identity, **({"pieces": pieces} if pieces > 1 else {})})
     try:
-        out.mkdir(parents=True, exist_ok=True)  # hours before it is needed
+        out.mkdir(parents=True, exist_ok=True)  # fail here, hours before the folder is needed
     except OSError as error:
         raise ConfigError(f"{out}: cannot be made a folder: {error}") from error
     generator = Generator().manual_seed(job.seed)
-    torch.manual_seed(job.seed)  # dropout does not depend on what was drawn before
+    torch.manual_seed(job.seed)  # dropout must not depend on earlier draws
     position, best = Position(), None
     if run.resume:
         position, best = load_checkpoint(file, job, generator)
@@ -90,7 +90,7 @@ def fit(job: Job, out: Path, run: Run = ALONE, clock: Callable[[], float] = time
             found, interrupted = gradients.read(made, position.step, pressed())
             for loss, norm in found:
                 position = _moved(position, loss)
-                looks = looked and position.step == step + 1  # the last of those that are read
+                looks = looked and position.step == step + 1  # only the last of the steps that are read
                 if looks:
                     position = _compared(position, group.from_first(partial(_held_out, job)))
                     best = weights_of(job) if position.worse == 0 else best
@@ -139,7 +139,7 @@ def schedule(step: int, phase: config.Phase) -> float:
 
 
 def _set_rates(job: Job, step: int) -> None:
-    """Set the rates of `step` from those of the new optimizers, which stay as `initial_lr`."""
+    """Set the learning rates of `step` from the initial ones, which are kept as `initial_lr`."""
     share = schedule(step, job.phase)
     for one in job.optimizers:
         for group in one.param_groups:
@@ -149,7 +149,7 @@ def _set_rates(job: Job, step: int) -> None:
 def make_step(gradients: Gradients, step: int, generator: Generator) -> Tensor:
     """Update the weights once; return loss and largest gradient norm (2,) of this process, on the device.
 
-    Raises ModelError when loss or norm of a CPU is not finite, and nothing is updated then; GroupError.
+    Raises ModelError, on a CPU and before updating anything, if loss or norm is not finite; GroupError.
     """
     job = gradients.job
     for one in job.optimizers:
@@ -179,7 +179,7 @@ def _enough_memory(
     generator: Generator,
     best: Weights | None,
 ) -> Iterator[None]:
-    """Run a step; where the GPU has too little memory, write a checkpoint of those `made`, and raise ModelError."""
+    """Run a step; if the GPU has too little memory, write a checkpoint of the steps `made`, and raise ModelError."""
     try:
         yield
     except torch.OutOfMemoryError as error:
@@ -206,7 +206,7 @@ def _clip(one: torch.optim.Optimizer, norm: float) -> Tensor:
 
 
 def _held_out(job: Job) -> float:
-    """Return the held-out loss; random states and the model's mode stay. Raises ModelError if it is not finite."""
+    """Return the held-out loss; random states and the model's mode are kept. Raises ModelError if it is not finite."""
     assert job.held_out is not None
     job.model.eval()
     devices = [job.device] if job.device.type == "cuda" else []
@@ -226,7 +226,7 @@ def _compared(position: Position, held_out: float) -> Position:
 
 @contextmanager
 def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns whether Ctrl-C was pressed; inside, the first one only raises the flag.
+    """Yield a function that returns whether Ctrl-C was pressed; in the context, the first one only sets a flag.
 
     `patient`: later ones too, since torchrun passes on those of the terminal. Signals reach the main thread only.
     """
@@ -235,7 +235,7 @@ def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
     def press(number: int, frame: FrameType | None) -> None:
         pressed.set()
         if not patient:
-            signal.signal(signal.SIGINT, before)  # the second one does what it always did
+            signal.signal(signal.SIGINT, before)  # the second one has its usual effect
 
     if threading.current_thread() is not threading.main_thread():
         yield pressed.is_set
@@ -252,9 +252,9 @@ def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
 
 
 def pieces_of(job: Job, run: Run, file: Path) -> int:
-    """Return into how many pieces every batch is cut: on resuming as in the checkpoint `file`, else as the run sets.
+    """Return the number of pieces of every batch: on resuming that of the checkpoint `file`, else set by the run.
 
-    Raises ConfigError where the processes cannot share them, or where they cannot share the batch.
+    Raises ConfigError if the processes cannot share the pieces, or the batch cannot be cut into them.
     """
     size, batch = run.group.size, job.phase.batch
     pieces = size * (run.accumulate or 1)
@@ -297,7 +297,7 @@ class Gradients:
         for piece in mine:
             digest = hashlib.blake2b(f"{self.job.seed} {step} {piece}".encode(), digest_size=7)
             seed = int.from_bytes(digest.digest(), "big")
-            torch.manual_seed(seed)  # of dropout
+            torch.manual_seed(seed)  # for dropout
             quiet = isinstance(self._loss, DistributedDataParallel) and piece != mine[-1]
             with self._loss.no_sync() if quiet else nullcontext():  # type: ignore[operator]
                 total += self._piece(step, Generator().manual_seed(seed), len(mine))
@@ -305,7 +305,7 @@ class Gradients:
 
     @contextmanager
     def talking(self, step: int) -> Iterator[None]:
-        """Run a part of a step that talks to the other processes. Raises GroupError, which names job and checkpoint."""
+        """Run a part of a step that needs the other processes. Raises GroupError, which names job and checkpoint."""
         try:
             yield
         except GroupError as error:
@@ -315,7 +315,7 @@ class Gradients:
     def read(self, made: list[Tensor], first: int, pressed: bool) -> tuple[list[tuple[float, float]], bool]:
         """Return losses and norms of steps from `first` on, and whether Ctrl-C was pressed in any process.
 
-        Waits for the device. Raises ModelError for one that is not finite, GroupError.
+        Waits for the device. Raises ModelError for a value that is not finite; GroupError.
         """
         losses, norms = torch.stack(made, dim=1).tolist()
         with self.talking(first + len(made) - 1):
@@ -326,7 +326,7 @@ class Gradients:
         return found, asked > 0
 
     def check(self, made: Sequence[float], step: int) -> None:
-        """Raise ModelError where loss or norm of a step is not finite."""
+        """Raise ModelError if loss or norm of a step is not finite."""
         if not all(map(math.isfinite, made)):
             broken = f"loss {made[0]:g}, gradient norm {made[1]:g} at step {step}: not finite"
             raise ModelError(f"{self.job.name}: {broken} ({_kept(self.file)})")
@@ -340,7 +340,7 @@ class Gradients:
 
 
 class _Loss(nn.Module):
-    """A job's loss as a module, which is what gradients are shared of."""
+    """A job's loss as a module: DistributedDataParallel shares the gradients of modules."""
 
     def __init__(self, model: nn.Module, loss_of: LossOf) -> None:
         super().__init__()
@@ -397,7 +397,7 @@ def write_whole(file: Path, tensors: Weights, metadata: dict[str, str]) -> None:
     part = file.with_suffix(".part")
     try:
         save_file(tensors, part, metadata)
-        part.chmod(0o644)  # safetensors leaves it readable by its owner alone
+        part.chmod(0o644)  # safetensors makes it readable only by its owner
         with part.open("rb") as written:
             os.fsync(written.fileno())
         part.replace(file)
@@ -408,7 +408,7 @@ def write_whole(file: Path, tensors: Weights, metadata: dict[str, str]) -> None:
 
 
 def load_checkpoint(file: Path, job: Job, generator: Generator) -> tuple[Position, Weights | None]:
-    """Put model, optimizers and all random states where `file` left them.
+    """Restore model, optimizers and all random states from `file`.
 
     Raises:
         ConfigError: there is no checkpoint, or it is of another job; names the first key that differs.
@@ -437,9 +437,9 @@ def load_checkpoint(file: Path, job: Job, generator: Generator) -> tuple[Positio
 
 
 def peek(file: Path) -> tuple[Position, int] | None:
-    """Return the position of the checkpoint in `file`, and into how many pieces its batches are cut.
+    """Return the position of the checkpoint in `file`, and the number of pieces of its batches.
 
-    None if there is no readable one.
+    None if there is no readable checkpoint.
     """
     try:
         metadata, _ = _read(file, tensors=False)

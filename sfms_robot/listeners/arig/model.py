@@ -8,9 +8,9 @@ frame T. Offline everything is parallel over T (teacher forcing):
     motion = model.sample_loss(found.z.flatten(0, 1), model.moved(...).flatten(0, 1))
 
 `condition` is the part before the sampler, `sample` the sampler; `stream.ArigListener` computes both frame by frame,
-the same by a law of the tests. Buffers that training sets from its data: `motion_mean`, `motion_std`, `sound_mean`,
-`sound_std`, and of the diffusion head `low`, `high`, the range of what it draws. Everything that goes in and out here
-is in plain units: motion of the listener's motion space, sound features of `audio_frontend.track`.
+with the same results (a law of the tests). Buffers that training sets from its data: `motion_mean`, `motion_std`,
+`sound_mean`, `sound_std`, and of the diffusion head `low`, `high`, the range of its draws. All inputs and outputs here
+are in plain units: motion of the listener's motion space, sound features of `audio_frontend.track`.
 
 Sections of the paper and the files of this folder that follow them:
 
@@ -49,34 +49,35 @@ MEAN_DELTA = 4.0  # deviations beyond which an error of the mean counts linearly
 
 # --- What the sampler draws -------------------------------------------------------------------------------------------
 #
-# In the paper the sampler draws the motion of a frame, equation (4), and that is all (`draws: motion`). Ours, because a
-# stream that draws motion on its own past grows restless or drifts. x_t is standardised motion, s the draw of a frame:
+# In the paper the sampler draws the motion of a frame, equation (4) (`draws: motion`). The others are ours, because a
+# stream that draws motion from its own past becomes restless or drifts. x_t is standardised motion, s the draw of a
+# frame:
 #
 #     draws        x_t =                                          s = `moved`
 #     motion       s                                              x_t
 #     step         x_(t-1) + step_std s                           (x_t - x_(t-1)) / step_std
 #     innovation   rho x_(t-1) + step_std sinh(spread s)          asinh((x_t - rho x_(t-1)) / step_std) / spread
 #
-# - `step` is small where a face is still, and so is what the sampler gets wrong; but errors add up.
-# - `innovation` is a first-order autoregression, rho < 1 the lag-1 autocorrelation of the data: errors are forgotten at
-#   that rate, so a head stays as near its mean as in the data, however long a stream runs. A face mostly hardly moves
-#   and at times moves a hundred times as fast: asinh above `step_std` compresses what moves fast and leaves precision
-#   to what hardly moves. The last draw is an input of the sampler beside z, because how fast the face moves is too
-#   fine for the few numbers of z. The mean of s is predicted (`mean`), and the sampler draws the rest: an event shows
-#   after few steps of training, whatever the sampler's temperature.
+# - `step` is small where a face is still, and so are errors of the sampler; but errors add up.
+# - `innovation` is a first-order autoregression, rho < 1 the lag-1 autocorrelation of the data: errors decay at that
+#   rate, so a head stays as near its mean as in the data, however long a stream runs. A face mostly hardly moves and at
+#   times moves a hundred times as fast: asinh above `step_std` compresses fast motion and leaves precision to slow
+#   motion. The last draw is an input of the sampler in addition to z, because the speed of the face is too fine for the
+#   few numbers of z. The mean of s is predicted (`mean`), and the sampler draws the rest: an event shows after few
+#   steps of training, whatever the sampler's temperature.
 # - `events`: control rows of the frame and of the one before it (`signals.control`) are a token of the fine prediction
-#   and an input of the sampler. The direction of the eyes is not drawn: it rests. Innovations are around the motion b
-#   expected of the events (`event_curves`),
+#   and an input of the sampler. The direction of the eyes is not drawn: it stays at rest. Innovations are around the
+#   motion b expected of the events (`event_curves`),
 #
 #         x_t = b_t + rho f_t (x_(t-1) - b_(t-1)) + step_std sinh(spread s),
 #
 #   with f_t < 1 while an event moves the channel (`event_curves.remains`), so that by its end nothing is left of other
-#   motion. A face that nothing moves, no event and no word of its own, is held within `rest_range` of b, the distance
-#   of such faces in the data, and beyond that comes back by rho a frame, whatever is drawn: a network that sees its
-#   own past holds a raised brow up for good.
-# - `sway`: slow motion of the head is made apart (`listeners.sway`) and is in no motion here. The rest of the head's
-#   motion is soon over, so `rho` forgets it within frames. Its past and its last draw are not inputs of the network
-#   (`is_recalled`): with them, it learned to swing the head from one end of its range to the other.
+#   motion. A face that neither an event nor its own speech moves is held within `rest_range` of b, the distance of such
+#   faces in the data. Beyond that it comes back by rho per frame, whatever is drawn: otherwise a network that sees its
+#   own past holds a raised brow up forever.
+# - `sway`: slow motion of the head is made separately (`listeners.idle`) and is not part of any motion here. The rest
+#   of the head's motion is short, so it decays by `rho` within frames. Its past and its last draw are not inputs of the
+#   network (`is_recalled`): with them, it learned to swing the head from one end of its range to the other.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,9 +89,9 @@ class ArigDyad:
         user_heard, agent_heard: (B, N) bool.
         user_motion: (B, N, C) motion of the listener's space; arbitrary where not seen.
         user_seen: (B, N) bool.
-        agent_motion: (B, N, C), without its sway where that is apart.
+        agent_motion: (B, N, C), without its sway if that is made separately.
         voiced: (B, N, 2) bool: speech of agent, user.
-        control: (B, N, K) of the agent's events; arbitrary for a model without.
+        control: (B, N, K) control rows of the agent's events; arbitrary for a model without events.
     """
 
     user_sound: Tensor
@@ -110,7 +111,7 @@ class SamplerCondition:
 
     Attributes:
         z: (B, N-1, D) with the further inputs of `ArigModel.beside`.
-        states: the states' logits (B, N-1, S) or None.
+        states: (B, N-1, S) logits of the states, or None.
         outline: (B, N-1, D) coarse motion.
         moved: (B, N-1, C) `ArigModel.moved` of the frame before.
     """
@@ -157,7 +158,7 @@ class ArigModel(ListenerModel):
         self.motion_low = nn.Buffer(torch.full((c,), -8.0))
         self.motion_high = nn.Buffer(torch.full((c,), 8.0))
         self.step_std = nn.Buffer(torch.ones(c))
-        self.is_told = settings.events and settings.draws == "innovation"  # knows the motion expected of events
+        self.is_told = settings.events and settings.draws == "innovation"  # draws around the motion expected of events
         if settings.draws == "innovation":
             self.rho = nn.Buffer(torch.zeros(c))
             self.spread = nn.Buffer(torch.ones(c))
@@ -175,11 +176,11 @@ class ArigModel(ListenerModel):
     # --- Motion and draws: the table above ----------------------------------------------------------------------------
 
     def expected(self, last: Tensor, rows: Tensor | None) -> Tensor:
-        """Return the standardised motion (..., C) that a draw of 0 gives after `last` (..., C); `rows` (..., 2K)."""
+        """Return the standardised motion (..., C) that a draw of 0 leads to after `last` (..., C); `rows` (..., 2K)."""
         if self.settings.draws != "innovation":
             return last  # ours (`step`), because a still face stays still
         if not self.is_told or rows is None:
-            return self.rho * last  # ours, because errors are forgotten at the rate of the data
+            return self.rho * last  # ours, because errors decay at the rate of the data
         before, now = rows.chunk(2, dim=-1)
         off = last - self._course(before)  # x_(t-1) - b_(t-1)
         # b_t + rho f_t (x_(t-1) - b_(t-1))
@@ -200,13 +201,13 @@ class ArigModel(ListenerModel):
         return self.companded(step) if self.settings.draws == "innovation" else step
 
     def companded(self, step: Tensor) -> Tensor:
-        """Return steps (..., C), in `step_std`, as they are drawn: fast motion is compressed."""
+        """Return the draws (..., C) of steps (..., C) in units of `step_std`: fast motion is compressed."""
         return step.asinh() / self.spread
 
     def drawn(self, sample: Tensor, last: Tensor, rows: Tensor | None = None, speaks: Tensor | None = None) -> Tensor:
         """Return the standardised motion (..., C) that a draw leads to, the inverse of `moved`.
 
-        `speaks` (...) bool: the agent, in this frame; None: it may.
+        `speaks` (...) bool: whether the agent speaks in this frame; None: it may.
         """
         if self.settings.draws == "motion":
             made = sample  # the paper's, equation (4)
@@ -221,10 +222,10 @@ class ArigModel(ListenerModel):
         return made.where(self.is_drawn, 0.0) if self.settings.events else made
 
     def _held(self, made: Tensor, begins: Tensor, row: Tensor, speaks: Tensor) -> Tensor:
-        """Return motion (..., C), near rest where neither an event of control `row` (..., K) nor a word moves the face.
+        """Return motion (..., C), held near rest where no event of control `row` (..., K) and no speech moves the face.
 
         There |x - b| <= max(rest_range, |begins - b|): a draw may not lead further from the expected motion b than
-        faces at rest are, and what already is further away comes back at least as fast as without a draw.
+        faces at rest are, and motion that is already further away comes back at least as fast as without a draw.
         """
         course = self._course(row)  # b_t
         free = speaks[..., None] | event_curves.moved_channels(row, self.moves)
@@ -234,9 +235,10 @@ class ArigModel(ListenerModel):
     # --- Sampler (3.4) ------------------------------------------------------------------------------------------------
 
     def sample(self, z: Tensor, noise: Tensor) -> Tensor:
-        """Return a draw (N, C), the mean included; z of `beside`, noise of `Denoiser.sample`.
+        """Return a draw (N, C), the mean included; z as returned by `beside`, noise as for `Denoiser.sample`.
 
-        What is drawn around the mean has the sampler's range, and so has the sum: no step is larger than in the data.
+        The part drawn around the mean is within the sampler's range, and so is the sum: no step is larger than in the
+        data.
         """
         drawn = self.head.sample(z, noise)
         if self.mean is not None and isinstance(self.head, Denoiser):
@@ -251,7 +253,7 @@ class ArigModel(ListenerModel):
         generator: torch.Generator | None = None,
         weights: Tensor | None = None,
     ) -> Tensor:
-        """Return equation (3) at `draws` noise levels, or the loss of codes, plus that of the mean, (N,).
+        """Return the loss (N,): equation (3) at `draws` noise levels, or the loss of codes, plus that of the mean.
 
         `wanted` (N, C): `moved` of the frame.
         """
@@ -272,21 +274,21 @@ class ArigModel(ListenerModel):
     # --- Embeddings (A.2) ---------------------------------------------------------------------------------------------
 
     def embed_events(self, rows: Tensor) -> Tensor | None:
-        """Return (..., D) of control rows of the frame before and the frame (..., 2K), or None without events."""
+        """Return the embedding (..., D) of control rows (..., 2K), frame before and frame; None without events."""
         return None if self.events_in is None else self.events_in(rows)
 
     def embed_sound(self, sound: Tensor, heard: Tensor, absent: Tensor) -> Tensor:
-        """Return (..., D) of features (..., A), and `absent` (D,) or (..., D) where not heard (...)."""
+        """Return the embedding (..., D) of features (..., A); `absent`, (D,) or (..., D), where not `heard` (...)."""
         out: Tensor = self.sound_in(self.standardise_sound(sound)[..., : self.sounds_read])
         return torch.where(heard[..., None], out, absent)
 
     def embed_own(self, motion: Tensor) -> Tensor:
-        """Return (..., D) of the agent's standardised motion (..., C), without channels that are not recalled."""
+        """Return the embedding (..., D) of the agent's standardised motion (..., C), recalled channels only."""
         out: Tensor = self.motion_in(motion.where(self.is_recalled, 0.0))
         return out
 
     def embed_face(self, motion: Tensor, seen: Tensor) -> Tensor:
-        """Return (..., D) of the user's standardised motion (..., C), seen (...) bool."""
+        """Return the embedding (..., D) of the user's standardised motion (..., C); `seen` (...) bool."""
         embedded: Tensor = self.motion_in(motion)
         return embedded if self.no_face is None else torch.where(seen[..., None], embedded, self.no_face)
 
@@ -295,15 +297,15 @@ class ArigModel(ListenerModel):
     def condition(self, dyad: ArigDyad, states: Tensor | None = None) -> SamplerCondition:
         """Return the inputs of the sampler for frames 1..N-1 at once.
 
-        `states` (B, N): the state of every frame; each frame is given the one before. Without, each frame continues
-        from the model's own answer, as a stream does.
+        `states` (B, N): the state of every frame; each frame gets the state of the frame before. Without it, each frame
+        continues from the model's own answer, as a stream does.
         """
         user = self.embed_sound(dyad.user_sound, dyad.user_heard, self.no_user_sound)[:, :-1]
         agent = self.embed_sound(dyad.agent_sound, dyad.agent_heard, self.no_agent_sound)
         standard = self.standardise(dyad.agent_motion)[:, :-1]
         motion = self.embed_own(standard)
         face = self.embed_face(self.standardise(dyad.user_motion), dyad.user_seen)[:, :-1]
-        b, t, d = motion.shape  # frame t of what follows is made from frames 0..t and makes frame t + 1
+        b, t, d = motion.shape  # below, index t is made from frames 0..t and is for frame t + 1
         c = self.settings.chunk_frames
         now = agent[:, 1:].reshape(b * t, d)
         summaries = self.short(

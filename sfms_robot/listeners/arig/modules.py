@@ -1,10 +1,10 @@
 """The modules of ARIG: interactive behaviours (3.2), conversation states (3.3) and progressive motion (3.4).
 
 Interactive behaviour understanding: the motion and sound of both people, a chunk at a time, and over a long range.
-Short range: the last c behaviours of both tracks, read again for every frame in the light of the newest sounds, become
-one summary. Long range: summaries of whole chunks, and that of the chunk in progress, which every frame refreshes
-until the chunk is full; a causal decoder makes the cis-token of them. A token sees the w - 1 chunks before its own, in
-every layer, so what a stream keeps is w - 1 keys and values per layer: those of whole chunks never change.
+Short range: for every frame, the last c behaviours of both tracks are processed again with the newest sounds and become
+one summary. Long range: a causal decoder makes the cis-token of the summaries of whole chunks and of the chunk in
+progress, whose summary every frame replaces until the chunk is full. A token sees the w - 1 chunks before its own, in
+every layer. So a stream keeps w - 1 keys and values per layer: those of whole chunks never change.
 
 N samples, c frames of a chunk, D width, h heads; B batch, T frames.
 """
@@ -46,13 +46,13 @@ class Merge(nn.Module):
         self.mlp = mlp((1 + visual) * width, width, width)
 
     def forward(self, sound: Tensor, motion: Tensor) -> Tensor:
-        """Return (..., D) of (..., D) and (..., D)."""
+        """Return the behaviour (..., D) of sound (..., D) and motion (..., D)."""
         out: Tensor = self.mlp(torch.cat([sound, motion], dim=-1) if self.visual else sound)
         return out
 
 
 class TrackSide(nn.Module):
-    """One track's side of a block of bidirectional learning (figure 7): own weights, attention with the other."""
+    """One track's side of a block of bidirectional learning (figure 7): own weights, joint attention with the other."""
 
     def __init__(self, width: int, hidden: int) -> None:
         super().__init__()
@@ -67,14 +67,14 @@ class TrackSide(nn.Module):
         return self.qkv(modulated(x, parts[0], parts[1])), parts
 
     def answer(self, x: Tensor, seen: Tensor, parts: Tensors) -> Tensor:
-        """Return (N, c, D) of x (N, c, D) and the attention (N, c, D) of its queries."""
+        """Return the output (N, c, D) of x (N, c, D) and the attention (N, c, D) of its queries."""
         # adaLN (A.1): gates of the attention and of the feed-forward, both modulated by the newest sound of the track.
         x = torch.addcmul(x, parts[2], self.out(seen))
         return torch.addcmul(x, parts[5], self.ffn(modulated(x, parts[3], parts[4])))
 
 
 class Bidirectional(nn.Module):
-    """Each track reads itself, and both see each other through one attention, as in MMDiT (figure 7)."""
+    """A block in which both tracks attend to themselves and to each other in one attention, as in MMDiT (figure 7)."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ class Bidirectional(nn.Module):
         self.user = TrackSide(width, hidden)
 
     def forward(self, agent: Tensor, user: Tensor, agent_sound: Tensor, user_sound: Tensor) -> tuple[Tensor, Tensor]:
-        """Return both tracks (N, c, D); newest sounds (N, D) with SiLU applied."""
+        """Return both tracks (N, c, D); SiLU was applied to the newest sounds (N, D)."""
         # One attention over the 2c tokens of both: each track's queries see both tracks' keys.
         agent_qkv, agent_parts = self.agent.ask(agent, agent_sound)
         user_qkv, user_parts = self.user.ask(user, user_sound)
@@ -92,7 +92,7 @@ class Bidirectional(nn.Module):
 
 
 class Integrated(nn.Module):
-    """Both tracks as one sequence; attention and feed-forward side by side (figure 8, Dehghani et al. 2023)."""
+    """A block over both tracks as one sequence, attention parallel to feed-forward (figure 8, Dehghani et al. 2023)."""
 
     def __init__(self, width: int, hidden: int, heads: int) -> None:
         super().__init__()
@@ -103,8 +103,8 @@ class Integrated(nn.Module):
         self.narrow = nn.Linear(width + hidden, width)
 
     def forward(self, x: Tensor, condition: Tensor, wanted: int) -> Tensor:
-        """Return the first `wanted` tokens (N, wanted, D) of x (N, 2c, D); condition (N, D) with SiLU applied."""
-        # One product makes queries, keys, values and the hidden layer; one brings attention and hidden layer back.
+        """Return the first `wanted` tokens (N, wanted, D) of x (N, 2c, D); SiLU was applied to condition (N, D)."""
+        # One product makes queries, keys, values and the hidden layer; another one joins attention and hidden layer.
         shift, scale, gate = self.modulation.of_tokens(condition)
         wide = self.wide(modulated(x, shift, scale))
         qkv, up = wide.narrow(-1, 0, self.asked), wide.narrow(-1, self.asked, self.hidden)[:, :wanted]
@@ -113,7 +113,7 @@ class Integrated(nn.Module):
 
 
 def _attend(qkv: Tensor, heads: int, wanted: int | None = None) -> Tensor:
-    """Return full self-attention of (N, S, 3D) for the first `wanted` of S tokens, or all (N, wanted, D)."""
+    """Return full self-attention (N, wanted, D) of (N, S, 3D) for the first `wanted` of S tokens, or for all."""
     q, k, v = qkv.chunk(3, dim=-1)
     return attention(q[:, :wanted], k, v, heads)
 
@@ -146,7 +146,7 @@ class ShortRange(nn.Module):
         of_agent, of_user = F.silu(agent_sound), F.silu(user_sound)  # the updated audio modulates each track (A.1)
         for block in self.bidirectional:
             agent, user = block(agent, user, of_agent, of_user)
-        # The paper does not say which sound modulates the two tracks as one sequence. Ours: both do.
+        # The paper does not state which sound modulates the two tracks as one sequence. Ours: both do.
         x, condition = torch.cat([agent, user], dim=1), F.silu(agent_sound + user_sound)
         for left, block in enumerate(self.integrated, 1 - len(self.integrated)):
             x = block(x, condition, 2 * c if left else c)
@@ -170,7 +170,7 @@ class ContextLayer(nn.Module):
         self.ffn = FeedForward(width, hidden)
 
     def project(self, x: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return queries, keys, values (B, h, T, D/h) of x (B, T, D), turned.
+        """Return queries, keys, values (B, h, T, D/h) of x (B, T, D); queries and keys are rotated.
 
         `rotary`: (2, T, D/h) or (2, B, 1, 1, D/h).
         """
@@ -188,15 +188,15 @@ class ContextLayer(nn.Module):
 
         Args:
             x: summaries.
-            own: `project` of them.
+            own: `project` of the summaries.
             past: keys and values (B, h, S, D/h) of whole chunks.
-            seen: (T, S) or (B, 1, 1, S), which of those each token may look at.
+            seen: (T, S) or (B, 1, 1, S), which of the whole chunks each token may attend to.
         """
         q, k, v = own
         q = q * q.shape[-1] ** -0.5
         scores = q @ past[0].transpose(-1, -2)  # (B, h, T, S)
         scores = torch.where(seen, scores, -torch.inf)
-        self_score = (q * k).sum(-1, keepdim=True)  # the token itself is scored apart: the cache is not copied
+        self_score = (q * k).sum(-1, keepdim=True)  # the token's score of itself is separate: the cache is not copied
         weights = torch.cat([scores, self_score], dim=-1).softmax(dim=-1)
         x = x + self.out(join_heads(weights[..., :-1] @ past[1] + weights[..., -1:] * v))
         out: Tensor = x + self.ffn(self.ffn_norm(x))
@@ -226,15 +226,15 @@ class LongRange(nn.Module):
     def forward(self, summaries: Tensor) -> Tensor:
         """Return cis-tokens (B, T, D) of the summaries (B, T, D) of every frame from the start of a stream.
 
-        Frame t belongs to chunk t // c, and the last of its frames makes the summary that stays.
+        Frame t belongs to chunk t // c, and the last frame of a chunk makes the summary that stays.
         """
-        # Chunk i holds frames ci to c(i + 1) - 1 (3.2). While it is in progress, each frame makes a new summary,
-        # as a stream refreshes it; later chunks see only that of its last frame.
+        # Chunk i holds frames ci to c(i + 1) - 1 (3.2). While it is in progress, each frame makes a new summary, as in
+        # a stream; later chunks see only the summary of its last frame.
         t = summaries.shape[1]
         frame = torch.arange(t, device=summaries.device)
         of = frame // self.chunk
         whole = frame[self.chunk - 1 :: self.chunk]  # frames whose summaries stay
-        behind = of[:, None] - of[whole]  # chunks from a kept summary to that of each frame, (T, S)
+        behind = of[:, None] - of[whole]  # number of chunks from a kept summary to the chunk of each frame, (T, S)
         seen = (behind > 0) & (behind < self.capacity)  # (T, S)
         x, turned = summaries, _turned(t, self.chunk, self.head_width, summaries.device)
         for layer in self._layers():
@@ -244,13 +244,13 @@ class LongRange(nn.Module):
         return out
 
     def step(self, summary: Tensor, past: Sequence[Tensor], seen: Tensor, rotary: Tensor) -> tuple[Tensor, Tensor]:
-        """Take one frame of N streams.
+        """Process one frame of N streams.
 
         Args:
             summary: (N, D) of the chunk in progress.
             past: (N, h, S, D/h) keys and values of the last S whole chunks, oldest first, layer by layer: 2L of them.
-            seen: (N, S) bool, which of them there have been.
-            rotary: (N, 2, D/h) of this chunk.
+            seen: (N, S) bool, which of these chunks there have been.
+            rotary: (N, 2, D/h) rotary place of this chunk.
 
         Returns:
             cis-token (N, D), and keys and values (N, 2L, h, D/h) of this summary, in case it is the last of its chunk.
@@ -267,8 +267,8 @@ class LongRange(nn.Module):
 
 # --- Conversation states understanding (3.3) --------------------------------------------------------------------------
 #
-# Which of seven states the agent is in, and a feature of it. Voice activity alone has four patterns; which state a
-# pattern means depends on the conversation (figure 3):
+# The module finds which of seven states the agent is in, and a feature of that state. Voice activity alone has four
+# patterns; the state that a pattern means depends on the conversation (figure 3):
 #
 #     agent    user     states
 #     speaks   silent   speaking
@@ -276,17 +276,17 @@ class LongRange(nn.Module):
 #     silent   speaks   listening, giving feedback
 #     silent   silent   thinking (its own pause), waiting (the other's)
 #
-# The figure itself is not in the text at hand; giving feedback, where it is a word and not a nod, is speech of both.
+# The figure itself is missing in the text that we have; giving feedback by a word, not by a nod, is speech of both.
 # The paper's stream continues from its most probable state. Ours, with events: it draws states and their durations
-# (`stream.draw_sojourn`), and feedback that is seen (a nod, a smile) is a state of its own.
+# (`stream.draw_sojourn`), and visible feedback (a nod, a smile) is a separate state.
 
 
 class StateUnderstanding(nn.Module):
     """Cross attention of the previous state over voice activity and cis-token -> the state feature and the state.
 
     With events its states are `EVENT_STATES`, and it also has statistics of the data: `durations` (7, 33), quantiles of
-    how many frames each of `STATES` lasts, and `possible` (2, 2, 7), 1 for the states that occur while agent and user
-    are silent or speak.
+    the duration of each of `STATES` in frames, and `possible` (2, 2, 7), 1 for the states that occur while agent and
+    user are silent or speak.
     """
 
     def __init__(self, settings: config.Arig) -> None:
@@ -328,14 +328,14 @@ class StateUnderstanding(nn.Module):
 
 # --- Progressive motion prediction (3.4) ------------------------------------------------------------------------------
 #
-# Coarse motion from sound, fine motion from context and state, continuity. The result z conditions the sampler of
-# the final motion (`sampler`).
+# Coarse motion from sound, then fine motion from context and state, then continuity. The result z conditions the
+# sampler of the final motion (`sampler`).
 
 
 class Progressive(nn.Module):
-    """Three looks: at the agent's last sounds, at (cis-token, state, sound of now), at its last motions.
+    """Three cross attentions: over the agent's last sounds, (cis-token, state, current sound), and its last motions.
 
-    Ours: events are one token more of the second.
+    Ours: the second one has one more token, the events.
     """
 
     def __init__(self, settings: config.Arig) -> None:
@@ -359,11 +359,11 @@ class Progressive(nn.Module):
 
         Args:
             outline: (N, D) coarse motion: `coarse` of the embedded motion of the frame before, over the keys of the
-                agent's sounds, the newest that of the frame itself.
+                agent's sounds; the newest sound is that of the frame itself.
             motion_keys: (N, 5, 2D) `temporal.keys` of the agent's motions before the frame.
             sound: (N, D) embedded sound of the agent in the frame itself.
-            cis: (N, D).
-            state: (N, D) feature, or None without state guidance.
+            cis: (N, D) cis-token.
+            state: (N, D) state feature, or None without state guidance.
             events: (N, D) embedded control rows, or None without events.
         """
         # A.1: cis-token, state feature and A^a_T condition the fine motion; then five motions, for continuity.

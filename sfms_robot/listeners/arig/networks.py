@@ -1,8 +1,8 @@
 """The computation of one frame of a stream, as functions of tensors: `FrameNetwork` up to the sampler, `DrawNetwork`.
 
-Offline the same parts run over all frames at once (`model.condition`); that both agree is a law of the tests. As
-functions of tensors alone they can be exported. `RestNetwork` makes the memory before the first frame. Below them:
-which layers graphs may have in 8-bit integers.
+Offline the same parts run over all frames at once (`model.condition`); a law of the tests is that both agree. As
+functions of tensors alone they can be exported. `RestNetwork` makes the memory before the first frame. Below them is
+the choice of layers that graphs may have in 8-bit integers.
 
 N streams, mostly one; A features of sound, C channels, D width, K numbers of a control row, c frames of a chunk, S
 whole chunks that are kept, L layers that look at them.
@@ -21,7 +21,7 @@ class RestNetwork(Network[ArigModel]):
     """A still face and silence as the memory of a stream: called once, when a listener is loaded."""
 
     def forward(self, still: Tensor) -> Tensors:
-        """Return embedded motion and silence (1, D), and the keys of each (1, 2D), of still (1, C) standardised."""
+        """Return embedded motion and silence (1, D), and their keys (1, 2D), of standardised motion `still` (1, C)."""
         progress, motion, silence = self.model.progress, self.model.embed_own(still), self.model.no_agent_sound[None]
         return motion, silence + 0.0, progress.temporal.keys(motion), progress.coarse.keys(silence)
 
@@ -55,16 +55,16 @@ class FrameNetwork(Network[ArigModel]):
         rows: Tensor,
         *past: Tensor,
     ) -> Tensors:
-        """Take one frame, equation (2).
+        """Process one frame, equation (2).
 
         Args:
             sounds: (N, 2, A) of user and agent; heard: (N, 2) bool, which of them are there.
             voiced: (N, 2) bool, speech of agent, user.
             face: (N, C) standardised motion of the user; seen: (N,) bool.
-            first: (N,) bool, of the stream: chunks begin as its behaviour repeated (A.2).
+            first: (N,) bool, first frame of the stream: chunks begin as its behaviour repeated (A.2).
             state: (N,) conversational state of the frame before.
-            rotary, view, past: place, chunks that there have been, and keys and values of `LongRange.step`.
-            agent_sound, ...: of `stream.ArigMemory`.
+            rotary, view, past: arguments of `LongRange.step`: place, chunks that there have been, keys and values.
+            agent_sound, ...: fields of `stream.ArigMemory`.
             rows: (N, 2K) control of the frame before and of the frame to be made; arbitrary without events.
 
         Returns:
@@ -107,9 +107,9 @@ class DrawNetwork(Network[ArigModel]):
         """Draw one frame.
 
         Args:
-            z: of `FrameNetwork`; noise: (N, *noise_shape).
-            standard: (N, C) standardised motion of the frame before; motion_keys: of `stream.ArigMemory`.
-            rows: (N, 2K) of `FrameNetwork`, and speaks: (N,) bool, the agent; for a listener with events.
+            z: output of `FrameNetwork`; noise: (N, *noise_shape).
+            standard: (N, C) standardised motion of the frame before; motion_keys: field of `stream.ArigMemory`.
+            rows: (N, 2K) as in `FrameNetwork`, and speaks: (N,) bool, the agent's speech; for a listener with events.
 
         Returns:
             Motion (N, C) in plain units, the same standardised (N, C), `model.moved` (N, C), embedded (N, D), and the
@@ -139,12 +139,12 @@ def networks(model: ArigModel) -> dict[str, Network[ArigModel]]:
 
 # --- Large layers in 8 bits -------------------------------------------------------------------------------------------
 #
-# Dynamic quantization, of graphs. One frame at a time, a layer costs what it takes to read its weights; in bytes that
-# is a quarter. Weights are rounded per output row, the input by its own range. Small layers stay in 32 bits: they gain
-# nothing. The sampler's blocks in integers stay in the fastest cache.
+# Dynamic quantization, of graphs. For one frame at a time, the cost of a layer is the time to read its weights, and
+# bytes take a quarter of it. Weights are rounded per output row, the input by its own range. Small layers stay in 32
+# bits: they gain nothing. The sampler's blocks in integers stay in the fastest cache.
 
 PARTS = ("sound_in", "merge_agent", "merge_user", "short", "long", "states", "progress")
-SAMPLER = ("head.modulation.", "head.up.", "head.down.")  # all products of every step but the first and last
+SAMPLER = ("head.modulation.", "head.up.", "head.down.")  # all products of a step except the first and the last
 SMALLEST = 64 * 1024  # weights of a layer below which integers gain nothing
 
 

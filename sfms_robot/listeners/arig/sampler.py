@@ -2,10 +2,10 @@
 
 Training: noise prediction, equation (3). Sampling: equation (4) over evenly spread noise levels (the spacing of
 Nichol and Dhariwal 2021, as the paper trains and samples with different step counts), or DDIM (Song et al. 2021).
-The sampler draws nothing itself: noise is an argument, so one seed gives one motion wherever it is drawn.
+The sampler draws no random numbers: noise is an argument, so one seed leads to one motion wherever it is drawn.
 
-Ours: the schedule is a cosine that ends at a signal amplitude of 0.03 instead of 0, because predicting noise says
-nothing about motion where there is none, and with 15 steps the first of them would be wasted on that.
+Ours: the schedule is a cosine that ends at a signal amplitude of 0.03 instead of 0, because at 0 a prediction of the
+noise has no information about motion, and the first of 15 steps would be wasted.
 
 N samples, C channels, D width of the condition, W width of the blocks, K steps.
 """
@@ -25,7 +25,7 @@ from sfms_robot.listeners.layers import Modulation, Tensors, mlp, modulated, sin
 from sfms_robot.listeners.sfms.quantizer import Grid
 
 Parts = Sequence[Tensor]  # shift, scale, gate of each block, then shift and scale before the last layer
-BEYOND_ALL = 1e4  # deviations: an estimate that is not clamped is clamped to this, which 16 bits hold
+BEYOND_ALL = 1e4  # deviations: the range of estimates without `clamp`, which 16 bits hold
 COSINE_END = 0.98  # share of the quarter circle that the schedule covers
 FINEST = 0.01  # deviations of noise at the first logarithmic level: most motion from frame to frame is larger
 
@@ -36,7 +36,7 @@ def noise_levels(settings: config.Diffusion) -> Tensor:
     share = torch.arange(1, settings.train_steps + 1, dtype=torch.float64) / settings.train_steps
     if settings.schedule == "cosine":
         return torch.cos(share * COSINE_END * math.pi / 2) ** 2
-    # Ours: noise over motion n = sqrt((1 - ab) / ab) grows by the same factor each level, to where the cosine ends.
+    # Ours: noise over motion n = sqrt((1 - ab) / ab) grows by the same factor each level, up to the end of the cosine.
     most = math.tan(COSINE_END * math.pi / 2)
     return 1 / (1 + (FINEST * (most / FINEST) ** share) ** 2)
 
@@ -52,11 +52,11 @@ class Denoiser(nn.Module):
         self.low = nn.Buffer(torch.full((channels,), -most))  # range of standardised motion in the data
         self.high = nn.Buffer(torch.full((channels,), most))
         self.alpha_bar = nn.Buffer(noise_levels(settings).float(), persistent=False)
-        self.places = nn.Buffer(sinusoidal(settings.train_steps, width), persistent=False)  # of all noise levels
+        self.places = nn.Buffer(sinusoidal(settings.train_steps, width), persistent=False)  # places of noise levels
         # Figure 9: noise level and z, projected to the width of the blocks (A.2), modulate three MLP blocks by adaLN.
         self.time = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.condition = nn.Linear(condition, width)
-        self.modulation = Modulation(width, "scg" * settings.blocks + "sc")  # of every block, in one product
+        self.modulation = Modulation(width, "scg" * settings.blocks + "sc")  # modulation of every block in one product
         self.enter = nn.Linear(channels, width)
         self.up = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))
         self.down = nn.ModuleList(nn.Linear(width, width) for _ in range(settings.blocks))
@@ -73,7 +73,7 @@ class Denoiser(nn.Module):
         self.spreads = nn.Buffer(spreads, persistent=False)
 
     def level(self, t: Tensor) -> Tensor:
-        """Return embeddings (K, W) of noise levels (K,): constant once the weights are."""
+        """Return embeddings (K, W) of noise levels (K,): constant if the weights are."""
         out: Tensor = self.time(self.places[t])
         return out
 
@@ -99,8 +99,8 @@ class Denoiser(nn.Module):
         Args:
             z: (N, D) conditions.
             motion: (N, C) standardised.
-            generator: draws levels and noise, on its own device; None: torch's own, there.
-            weights: (C,) of the channels, which add up to 1. Ours: by number most channels are of the mouth.
+            generator: draws levels and noise, on its own device; None: torch's generator on the device of the motion.
+            weights: (C,) of the channels, which add up to 1. Ours, because by number most channels are of the mouth.
         """
         n = len(motion)
         place = motion.device if generator is None else generator.device
@@ -141,12 +141,12 @@ class Denoiser(nn.Module):
 
 @dataclass(frozen=True)
 class Step:
-    """Numbers of one step from level t to the next lower s.
+    """Coefficients of one step from level t to the next lower level s.
 
     Attributes:
         denoise: M_0 = denoise[0] M_t + denoise[1] eps.
-        motion, stay: M_s = motion M_0 + stay M_t; for DDIM that is all.
-        spread: sigma_t, the factor of the added noise (beside the temperature); 0 for the last step.
+        motion, stay: M_s = motion M_0 + stay M_t; DDIM adds no noise to that.
+        spread: sigma_t, the factor of the added noise (times the temperature); 0 for the last step.
     """
 
     denoise: tuple[float, float]
@@ -159,8 +159,8 @@ def steps_of(levels: Sequence[int], settings: config.Diffusion) -> list[Step]:
     """Return the steps over ascending `levels`, noisiest first.
 
     Equation (4) written through the clean motion M_0 = (M_t - sqrt(1 - ab_t) eps) / sqrt(ab_t): its mean is
-    sqrt(ab_s) (1 - alpha) / (1 - ab_t) M_0 + sqrt(alpha) (1 - ab_s) / (1 - ab_t) M_t, alpha = ab_t / ab_s, and where
-    M_0 is not clamped the two are the same. sigma^2 = (1 - alpha) (1 - ab_s) / (1 - ab_t).
+    sqrt(ab_s) (1 - alpha) / (1 - ab_t) M_0 + sqrt(alpha) (1 - ab_s) / (1 - ab_t) M_t, alpha = ab_t / ab_s. If M_0 is
+    not clamped, both forms are the same. sigma^2 = (1 - alpha) (1 - ab_s) / (1 - ab_t).
     DDIM keeps the noise: M_s = sqrt(ab_s) M_0 + stay (M_t - sqrt(ab_t) M_0), stay^2 = (1 - ab_s) / (1 - ab_t).
     """
     alpha_bars = noise_levels(settings)[list(levels)].tolist()
@@ -199,8 +199,8 @@ class CodeHead(nn.Module):
     def loss(
         self, z: Tensor, motion: Tensor, generator: torch.Generator | None = None, weights: Tensor | None = None
     ) -> Tensor:
-        """Return cross-entropy of the code plus squared error of the code, (N,); arguments as `Denoiser.loss`."""
-        # B.1: the softmax learns which code; encoder and decoder learn from what the code makes of the motion.
+        """Return cross-entropy of the code plus squared error of its motion, (N,); arguments as in `Denoiser.loss`."""
+        # B.1: the softmax learns the code; encoder and decoder learn from the motion that the code decodes to.
         code = self.grid.nearest(self.encode(motion)[:, None])  # (N, 1, dims)
         rebuilt = weighted_mean((self.decode(code[:, 0]) - motion).square(), weights)
         wrong: Tensor = F.cross_entropy(self.classify(z), self.grid.indices(code.detach())[:, 0], reduction="none")

@@ -1,15 +1,14 @@
-"""ARIG as it runs: one speaker frame in, our face of the next frame out, and a memory of fixed size. numpy only.
+"""ARIG as a stream: one speaker frame in, our face of the next frame out, and a memory of fixed size. numpy only.
 
 Nothing is computed twice: behaviours of old frames, keys and values of old sounds, motions and whole chunks are kept.
-Only the chunk in progress is read again, since the newest sounds modulate all of it.
+Only the chunk in progress is processed again, since the newest sounds modulate all of it.
 
-Ours: a listener with events (`config.ListenerSettings.events`) takes two control rows a frame, of the frame taken and
-of the
-frame to be made. Its conversational state is drawn (`draw_sojourn`); a stream of the paper's continues from its most
-probable one.
+Ours: a listener with events (`config.ListenerSettings.events`) accepts two control rows per frame: of the frame that
+came and of the frame to be made. Its conversational state is drawn (`draw_sojourn`); a stream of the paper continues
+from its most probable state.
 
-The robot's own voice belongs to the frame that is made, so `SpeakerFrame.agent_audio` is best given one frame early:
-its samples are those the robot says in the 40 ms after `time_s`. Given on time, lips follow one frame late.
+The robot's own voice belongs to the frame that is made, so `SpeakerFrame.agent_audio` should come one frame early: its
+samples are the robot's voice in the 40 ms after `time_s`. If it comes on time, lips follow one frame late.
 """
 
 from __future__ import annotations
@@ -33,35 +32,35 @@ from sfms_robot.listeners.space import MotionSpace
 from sfms_robot.listeners.stream_rng import Use, normals, uniforms
 from sfms_robot.signals.control import COLUMNS
 
-BEYOND = 1e3  # rad, m or of a blendshape: not a face
-CONTROL_ROWS: Final = 2  # of events: of the frame before and of the frame
+BEYOND = 1e3  # rad, m or value of a blendshape: no face has such values
+CONTROL_ROWS: Final = 2  # control rows per frame: of the frame before and of the frame
 ROTARY_BASE: Final = 10_000.0
 
 # --- Conversational states (3.3) --------------------------------------------------------------------------------------
 #
 # `modules` has the table of states. Ours, with events: a semi-Markov process in place of the most probable state, which
-# flickers. How long a state lasts is drawn from durations of the data, which comes next from the model's answer.
-# Feedback that is seen, a nod or a smile in the other's turn, is not drawn: events decide it.
+# flickers. The duration of a state is drawn from durations of the data, the next state from the model's answer.
+# Visible feedback, a nod or a smile in the other's turn, is not drawn: events decide it.
 
 FIRST: Final = STATES.index("waiting")  # state of a stream before its first frame
 LISTENING: Final = STATES.index("listening")
 FEEDBACK: Final = STATES.index("giving_feedback")
 NODDING: Final = EVENT_STATES.index("giving_feedback_nod")
 SMILING: Final = EVENT_STATES.index("giving_feedback_smile")
-QUANTILES: Final = 33  # of a state's durations that are kept
+QUANTILES: Final = 33  # number of quantiles of a state's durations
 _ACTIVE: Final = {kind: COLUMNS.index(f"{kind}.active") for kind in ("nod", "smile", "laugh")}
 
 
 @dataclass(frozen=True)
 class Sojourn:
-    """One of `STATES`, and how many frames more it lasts."""
+    """One of `STATES`, and the number of further frames that it lasts."""
 
     state: int
     left: int
 
 
 def with_feedback(states: NDArray[Any], rows: Floats) -> NDArray[Any]:
-    """Return states (...) of `EVENT_STATES`, of `STATES` and the control rows (..., K) of their frames.
+    """Return the `EVENT_STATES` (...) of states (...) among `STATES` and the control rows (..., K) of their frames.
 
     A nod, laugh or smile while listening is feedback; other states, and unknown ones, stay unchanged.
     """
@@ -76,17 +75,17 @@ def draw_sojourn(
 ) -> Sojourn:
     """Draw the state of a frame.
 
-    A state lasts as long as was drawn when it began, but ends at once where the voices rule it out. Then another one
-    follows, drawn by the model's logits among those that the voices allow; the same again where they allow no other.
+    A state lasts as long as was drawn when it began, but ends at once if the voices rule it out. Then another state
+    follows, drawn by the model's logits from those that the voices allow; the same again if they allow no other.
 
     Args:
-        durations, possible: of `modules.StateUnderstanding`.
+        durations, possible: buffers of `modules.StateUnderstanding`.
         logits: (S,) of the frame.
-        voiced: (2,) speech of agent and user, as the model takes it.
-        before: that of the frame before.
-        uniforms: (2,) in 0..1: which state, and for how long.
+        voiced: (2,) speech of agent and user, as for the model.
+        before: sojourn of the frame before.
+        uniforms: (2,) in 0..1, for the state and for its duration.
     """
-    # The voices of both leave some of the seven states (figure 3).
+    # The voices of both allow some of the seven states (figure 3).
     may = possible[int(voiced[0]), int(voiced[1])] > 0  # (7,), a new array
     if before.left > 0 and may[before.state]:
         return Sojourn(before.state, before.left - 1)
@@ -103,14 +102,14 @@ def draw_sojourn(
 
 
 def rotary(chunks: NDArray[np.integer], size: int) -> Floats:
-    """Return cosines and sines (N, 2, size) of chunk numbers (N,), sines of the first half negative.
+    """Return cosines and sines (N, 2, size) of chunk numbers (N,); sines of the first half are negative.
 
-    They turn keys and queries of the long range; the halves of `size` are the two coordinates of each plane. Computed
-    in double precision: after days of running the angles of two chunks still differ.
+    They rotate keys and queries of the long range; the halves of `size` are the two coordinates of each plane. Angles
+    are in double precision, so that after days of running those of two chunks still differ.
     """
     half = size // 2
     turns = np.tile(ROTARY_BASE ** (-np.arange(half) / half), 2)  # radians per chunk
-    angles = chunks[:, None] * turns  # place of a chunk: attention depends on how far apart two are, not on when
+    angles = chunks[:, None] * turns  # place of a chunk: attention depends on the distance of two, not on their time
     signs = np.where(np.arange(size) < half, -1.0, 1.0)
     return np.stack([np.cos(angles), np.sin(angles) * signs], axis=1).astype(np.float32)
 
@@ -123,18 +122,18 @@ class ArigMemory:
     """Memory of one stream. Values only, all of fixed size: a step makes a new one.
 
     Attributes:
-        seed: of all its random numbers (`stream_rng`).
-        frames: how many it has taken.
+        seed: seed of all its random numbers (`stream_rng`).
+        frames: number of frames so far.
         user_voice, agent_voice: samples and phrase of both tracks.
-        agent_sound: (D,) embedded, of the agent's last frame.
-        agent_behaviour, user_behaviour: (c, D) of the last c frames, the newest last.
-        sound_keys: (3, 2D) of the agent's last sounds; motion_keys: (5, 2D) of its last motions.
+        agent_sound: (D,) embedded sound of the agent's last frame.
+        agent_behaviour, user_behaviour: (c, D) behaviours of the last c frames, the newest last.
+        sound_keys: (3, 2D) keys of the agent's last sounds; motion_keys: (5, 2D) keys of its last motions.
         context: (2L, h, w - 1, D/h) keys and values of whole chunks, layer by layer, the newest last.
         motion: (D,) embedded motion of the agent's last frame; standard: (C,) the same, standardised; sample: (C,) the
             draw that led to it; all without sway.
-        state: conversational state of the last frame, of `settings.states`; sojourn: that which it is drawn from, with
-            events.
-        sway: of this stream (`HeadSway.start`).
+        state: conversational state of the last frame, of `settings.states`; sojourn: with events, the drawn state that
+            it comes from.
+        sway: sway of this stream (`HeadSway.start`).
     """
 
     seed: int
@@ -155,7 +154,7 @@ class ArigMemory:
     sway: Doubles
 
 
-# Fields that the network `frame` takes; it returns the first four.
+# Fields that are inputs of the network `frame`; it returns the first four.
 REMEMBERED: Final = (
     "agent_sound",
     "agent_behaviour",
@@ -165,18 +164,18 @@ REMEMBERED: Final = (
     "motion_keys",
     "sample",
 )
-_MADE: Final = (*REMEMBERED[:4], "standard", "sample", "motion", "motion_keys")  # by the networks, with every frame
+_MADE: Final = (*REMEMBERED[:4], "standard", "sample", "motion", "motion_keys")  # outputs of the networks per frame
 
 
 class ArigListener(RunsOnEngine):
     """ARIG as a stream; its engine runs `networks`.
 
     Attributes:
-        noise_shape: of the standard normal numbers that one frame takes: (steps, channels).
+        noise_shape: shape of the standard normal numbers of one frame: (steps, channels), (1, 1) with codes.
     """
 
     def __init__(self, settings: config.Arig, engine: Engine, folder: Path | None = None) -> None:
-        """Take the matrix that the settings may name from `folder`.
+        """Create the listener; the matrix that the settings may name is in `folder`.
 
         Raises ConfigError, and ModelError for a model of features that are not computed here (sound: wav2vec2).
         """
@@ -224,7 +223,7 @@ class ArigListener(RunsOnEngine):
         memories: Sequence[ArigMemory],
         controls: Sequence[Floats | None] | None = None,
     ) -> list[tuple[Plan | None, ArigMemory]]:
-        """Move every stream one frame on; each plans its next frame."""
+        """Advance every stream by one frame; each plans its next frame."""
         settings = self.settings
         rows = self.told(controls or [None] * len(memories)).reshape(len(memories), -1)
         sounds, present, face, seen, now = self._hear(speakers, memories)
@@ -266,29 +265,29 @@ class ArigListener(RunsOnEngine):
     def _states(
         self, logits: Floats, now: Sequence[ArigMemory], rows: Floats, voiced: Bools
     ) -> tuple[list[Sojourn], list[int]]:
-        """Return states of the frame that is made: the most probable, or drawn where the model has events."""
+        """Return states of the frame that is made: the most probable, or drawn if the model has events."""
         before = [memory.sojourn for memory in now]
         if not self.settings.state_guidance:
             return before, [memory.state for memory in now]
         if not self.settings.events:
             return before, logits.argmax(-1).tolist()
         durations, possible = (self.engine.tensors[f"states.{name}"] for name in ("durations", "possible"))
-        # Ours: a state lasts as long as in the data, and feedback that is seen comes from the events.
+        # Ours: a state lasts as long as in the data, and visible feedback comes from the events.
         sojourns = [
             draw_sojourn(durations, possible, scores, both, last, uniforms(own.seed, own.frames, Use.STATE, 2))
             for scores, both, last, own in zip(logits, voiced, before, now, strict=True)
         ]
-        # A nod or a smile under way makes listening a state of its own.
+        # A nod or a smile in progress turns listening into a separate state.
         drawn = np.array([sojourn.state for sojourn in sojourns])
         return sojourns, with_feedback(drawn, rows[:, -len(COLUMNS) :]).tolist()
 
     def _hear(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[ArigMemory]
     ) -> tuple[Floats, Bools, Floats, Bools, list[ArigMemory]]:
-        """Return both people in the newest frame of each of N streams, and memories of their voices up to it.
+        """Return both people in the newest frame of each of N streams, and memories that include their voices.
 
-        Features (N, 2, A) of user and agent, which of them there are (N, 2), the user's standardised face (N, C), and
-        whether there is one (N,).
+        The people are features (N, 2, A) of user and agent, which of them there are (N, 2), the user's standardised
+        face (N, C), and whether there is a face (N,).
         """
         # Equation (2): A^u_(T-1) of the user, and A^a_T of the agent, which is one frame ahead.
         samples = [track for one in speakers for track in (one.audio, fit_frame(one.agent_audio))]
@@ -301,7 +300,7 @@ class ArigListener(RunsOnEngine):
         face = np.zeros((len(speakers), len(self.settings.channels)), np.float32)
         seen = np.zeros(len(speakers), np.bool_)
         for row, speaker in enumerate(speakers):
-            # A face that is not finite or beyond all faces is not seen: the memory would keep it.
+            # A face that is not finite or beyond all faces counts as not seen: the memory would keep it.
             motion = None if speaker.face is None else speaker.face.motion
             if motion is not None and np.abs(motion).max() < BEYOND:  # false for NaN too
                 face[row], seen[row] = self.standardise(self.space.encode(motion[None]))[0], True

@@ -1,19 +1,21 @@
-"""Evidence for decisions, frame by frame: voices, looks, signs of faces, and the events of before.
+"""Evidence for decisions, frame by frame: voices, looks, signs of faces, and earlier events.
 
     SpeakerFrame -> signs of the face, voice, look (`Instant`) -> a row of evidence (`hear`); own events -> `done`
 
-A row of evidence is known once a frame is over; what comes after it changes nothing. Times are seconds, `math.inf` for
-what has never been. NaN: it does not apply, or is unknown, which speaks neither for nor against anything.
+A row of evidence is known at the end of a frame; later frames do not change it. Times are seconds, `math.inf` for
+something that has never happened. NaN: a value does not apply or is unknown, which is evidence neither for nor against.
 
-Of the others' voices together (`signals.phase`): how long the phrase lasts so far, their silence, the last phrase. The
-floor is held by the person, oneself among them, who is in a phrase of a second or more; of several the latest to begin,
-and the last one while none is. Looks count of those who speak now, else of the holder of the floor.
+The voices of all others together (`signals.phase`) have the duration of the phrase so far, of their silence and of the
+last phrase. The floor is held by a person, oneself included, in a phrase of a second or more. Of several such people
+the latest to begin holds it; while there is none, the last holder keeps it. The looks that count are those of the
+people who speak now, else those of the holder of the floor.
 
-Sound says whether the person speaks, the face whether they look, nod, smile and laugh. A head that talks moves all the
-time, by more than many a nod: only a silent person nods. Each input may be missing. No microphone: a mouth that moves
-is a voice. No face: no nod and no laugh. No attention: the head is looked at, for one person talks to one head; an
-attention of NaN is unknown, and so is that of a face that has had one before and is lost. Attention flickers; looked-at
-changes only when a quarter second of it, smoothed, has clearly crossed the middle.
+Sound shows whether the person speaks, the face whether they look, nod, smile and laugh. A talking head moves all the
+time, by more than many nods do: only a silent person nods. Each input may be missing. Without a microphone, a mouth
+that moves is a voice. Without a face there is no nod and no laugh. Without attention the head is looked at, because one
+person talks to one head. An attention of NaN is unknown; so is one that is missing after there has been one, and that
+of a lost face. Attention flickers: looked-at changes only when attention, smoothed over a quarter second, has clearly
+crossed the middle.
 """
 
 from __future__ import annotations
@@ -42,30 +44,30 @@ from sfms_robot.signals.events import CORNERS
 from sfms_robot.signals.phase import SpeechPhase
 from sfms_robot.signals.voice_activity import Ear
 
-# Of the others: seconds, but for flags (0 or 1).
+# Evidence of the others: seconds, except for flags (0 or 1) and the size of a smile.
 HEARD: Final = (
-    "phrase_s", "silence_s", "last_phrase_s",  # of all others together; the phrase only while it lasts
+    "phrase_s", "silence_s", "last_phrase_s",  # of all others together; phrase_s only while the phrase lasts
     "one_speaks", "several_speak",
-    "floor_mine", "floor_s", "holder_silence_s",  # since the floor changed hands, if it is another's
+    "floor_mine", "floor_s", "holder_silence_s",  # floor_s: since the holder changed; both only if it is another
     "own_voice_s", "own_voice_known",  # since the newest own voice; whether there has been any
-    "gaze_known", "looked_at", "looked_at_s", "looked_at_silence_s",  # the last two while looked at
-    "laugh_s", "others_nod_s", "others_smile_s",  # since the newest; of a nod and a smile since it began
+    "gaze_known", "looked_at", "looked_at_s", "looked_at_silence_s",  # the last two only while looked at
+    "laugh_s", "others_nod_s", "others_smile_s",  # since the newest one; a nod and a smile since it began
     "others_smile",  # size of that smile
 )  # fmt: skip
-# Of oneself: seconds since the newest one began or ended, but for the last three.
+# Evidence of own events: seconds since the newest one began or ended, except for the last three.
 DONE: Final = (
     "nod_s", "nod_end_s", "mm_hm_s", "laugh_end_s", "smile_end_s", "shake_end_s", "tilt_end_s", "brow_raise_end_s",
-    "blink_s", "shift_s", "at_person_s",  # since eyes moved; at_person_s while they are at the person
-    "root_nods_30s",  # root of how many began in the last 30 s
-    "log_rate",  # natural logarithm of nods a minute: a person's so far, a head's as it is set
+    "blink_s", "shift_s", "at_person_s",  # shift_s: since a gaze shift; at_person_s: the same, while at the person
+    "root_nods_30s",  # square root of the number of nods that began in the last 30 s
+    "log_rate",  # natural logarithm of nods per minute: measured so far for a person, as set for a head
 )  # fmt: skip
 EVIDENCE: Final = HEARD + DONE
 NUMBERS: Final = frozenset(name for name in EVIDENCE if not name.endswith("_s"))  # the others are seconds
 AT: Final[Mapping[str, int]] = {name: index for index, name in enumerate(EVIDENCE)}
 FLOOR_FRAMES: Final = 25  # a phrase this long takes the floor
-SMILES_APART: Final = 25  # frames: a smile that is back before is the same one
+SMILES_APART: Final = 25  # frames; a smile that is back sooner is the same smile
 COUNTED_S: Final = 30.0
-REMEMBERED_S: Final = 64.0  # after it what was done is long ago
+REMEMBERED_S: Final = 64.0  # older own events count as long ago
 EPS_S: Final = 1e-6
 MINE: Final = 0
 NOBODY: Final = -1
@@ -76,9 +78,9 @@ class Instant:
     """One frame of a conversation of P people, oneself the first.
 
     Attributes:
-        speaks, looks: (P,) each speaks; each looks at oneself, NaN: unknown.
-        laughs, nods: one of the others does, or begins to nod.
-        smiles: how large the smile of one of the others is (0..1); 0: none smiles.
+        speaks, looks: (P,) whether each speaks; whether each looks at oneself, NaN: unknown.
+        laughs, nods: whether one of the others laughs; whether one begins to nod.
+        smiles: size of the smile of one of the others (0..1); 0 if none of them smiles.
     """
 
     speaks: tuple[bool, ...]
@@ -90,15 +92,15 @@ class Instant:
 
 @dataclass(frozen=True, kw_only=True)
 class Hearing:
-    """The memory of a stream of the others.
+    """The memory of a stream about the others.
 
     Attributes:
         frame: number of frames so far.
         voices, each: phrases of all others together, and of each person, oneself the first.
-        spoke: newest frame of each one's voice.
-        holder, held: of the floor, and since which frame.
-        looked: since which frame one is looked at, None while not.
-        laughed, nodded, smiled: newest frames.
+        spoke: newest frame of each person's voice.
+        holder, held: holder of the floor, and the frame since which they hold it.
+        looked: frame since which one is looked at, None while not.
+        laughed, nodded, smiled: newest frames of a laugh, a nod and a smile.
         smile, began: size and first frame of the newest smile.
     """
 
@@ -122,12 +124,12 @@ class Hearing:
 
 
 def hearing(people: int = 2) -> Hearing:
-    """Return the memory at the beginning of a conversation of so many, oneself among them."""
+    """Return the memory at the beginning of a conversation of `people` people, oneself among them."""
     return Hearing(frame=0, voices=SpeechPhase(), each=(SpeechPhase(),) * people, spoke=(-math.inf,) * people)
 
 
 def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
-    """Take one frame; return its row (len(HEARD),) and the memory after it."""
+    """Process one frame; return its row of evidence (len(HEARD),) and the memory after it."""
     now = before.frame
     others = instant.speaks[1:]
     speaking = sum(others)
@@ -180,7 +182,7 @@ def hear(instant: Instant, before: Hearing) -> tuple[Doubles, Hearing]:
 
 
 def done(events: Iterable[ListenerEvent], now_s: float, log_rate: float) -> Doubles:
-    """Return the row (len(DONE),) at an instant, from events in the order of their beginnings.
+    """Return the row of evidence (len(DONE),) at an instant, from events in the order of their beginnings.
 
     Events that have yet to begin count as begun.
     """
@@ -208,40 +210,42 @@ def done(events: Iterable[ListenerEvent], now_s: float, log_rate: float) -> Doub
 
 
 def remembered(events: Sequence[ListenerEvent], now_s: float) -> Events:
-    """Return the events, in order, that may still matter: those of the last minute, of every kind the newest."""
+    """Return the events, in order, that may still matter: those of the last minute and the newest of every kind."""
     newest = {event.kind: event for event in events}
     return tuple(event for event in events if newest[event.kind] is event or event.end_s > now_s - REMEMBERED_S)
 
 
 # --- Signs of a face --------------------------------------------------------------------------------------------------
 #
-# Trackers make errors: a face may be upside down, stuck, saturated or all noise. So each sign is judged against the
-# last second of the same face or a running neutral, which a constant becomes; angles are taken modulo a whole turn;
-# and a nod is a swing larger than how the head swings anyway, by talking or by noise. A laugh is a broad smile over a
-# mouth that opens and closes: a person who talks and beams at once counts as laughing.
+# Trackers make errors: a face may be upside down, stuck, saturated or all noise. So each sign is compared with the
+# last second of the same face or with a running neutral, which approaches a constant value; angles are taken modulo a
+# whole turn; and a nod is a swing larger than the swings that talking or noise cause anyway. A laugh is a broad smile
+# and a mouth that opens and closes: a person who talks and beams at once counts as laughing.
 
-NOD_RAD: Final = math.radians(2.0)  # a swing there, within a second, and most of it back
+NOD_RAD: Final = math.radians(2.0)  # least swing of a nod, within a second, most of which is followed by the way back
 BACK: Final = 0.6
 WINDOW: Final = 25  # frames
 NODS_APART: Final = 30  # frames; more than a window, so that no swing counts twice
-STANDS_OUT: Final = 4.0  # times as far as the head swung over the last seconds, on average
-SMILE: Final = 0.25  # over the neutral
+STANDS_OUT: Final = 4.0  # least swing of a nod relative to the mean swing of the last seconds
+SMILE: Final = 0.25  # above the neutral
 BEAM: Final = 0.35
 HELD_FRAMES: Final = 6
-OPENING: Final = 0.02  # mean change of jawOpen per frame of a mouth that moves
-_SMOOTH: Final = 0.5  # share of a new value
-_NEUTRAL_RISE: Final = 0.02 * FRAME_S  # of the smile's neutral: a person who always beams is neutral within a minute
+OPENING: Final = 0.02  # least mean change of jawOpen per frame of a mouth that moves
+_SMOOTH: Final = 0.5  # weight of a new value
+_NEUTRAL_RISE: Final = 0.02 * FRAME_S  # per frame: a person who always beams is neutral within a minute
 _NEUTRAL_FALL: Final = 0.1
 _MOTION: Final = 0.12
-SWAY: Final = FRAME_S / 8.0  # of the mean swing: some eight seconds
+SWAY: Final = FRAME_S / 8.0  # weight of a new swing in the mean swing, which spans some eight seconds
 JAW: Final = CHANNEL_INDEX["jawOpen"]
 PITCH: Final = CHANNEL_INDEX["pitch"]
 
 
 @dataclass(frozen=True)
 class Signs:
-    """The signs of one frame: a nod has just been seen; how large the person's smile is (0: none); they laugh; the
-    mouth moves as in speech.
+    """The signs of one frame.
+
+    `nods`: a nod has just been seen; `smiles`: size of the person's smile (0: none); `laughs`: they laugh;
+    `mouth_moves`: the mouth moves as in speech.
     """
 
     nods: bool = False
@@ -256,9 +260,9 @@ class FaceState:
 
     Attributes:
         frame: number of frames so far.
-        pitch_rad: smoothed, unwrapped, of the last second.
+        pitch_rad: smoothed, unwrapped pitch of the last second.
         nodded: frame of the newest nod; sway_rad: mean swing of the last seconds.
-        neutral, held: neutral of the smile, and frames for which it has been up.
+        neutral, held: neutral of the smile, and number of frames for which the smile has been up.
         jaw, opening: jawOpen, and its change per frame.
     """
 
@@ -273,7 +277,7 @@ class FaceState:
 
 
 def read_signs(face: FaceFrame | None, state: FaceState) -> tuple[Signs, FaceState]:
-    """Read the signs of one frame of 40 ms: none without a face, or with one that is not finite."""
+    """Return the signs of one frame of 40 ms: none without a face, or with a face that is not finite."""
     motion = None if face is None else face.motion
     if motion is None or not np.isfinite(motion).all():
         return Signs(), changed(state, frame=state.frame + 1, pitch_rad=(), held=0, opening=0.0)
@@ -301,7 +305,7 @@ def _nod(pitch_rad: float, state: FaceState) -> tuple[bool, FaceState]:
 
 
 def _swing(values: tuple[float, ...] | list[float]) -> float:
-    """Return how far up it went, if by now it is most of the way back; else 0."""
+    """Return the height of the rise to the top, if most of the way back is done by now; else 0."""
     top = max(values)
     risen = top - min(values[: values.index(top) + 1])
     return risen if top - values[-1] >= BACK * risen else 0.0
@@ -315,7 +319,7 @@ def smoothed_pitch(pitch_rad: float, before_rad: float | None) -> float:
 
 
 def smile_over(level: float, neutral: float | None, held: int) -> tuple[float, float, int]:
-    """Return how far the smile is over its neutral, the neutral, and for how many frames it has been up."""
+    """Return the level of the smile above its neutral, the neutral, and the number of frames for which it is up."""
     level = _within(level)
     neutral = level if neutral is None else neutral
     neutral += _NEUTRAL_FALL * (level - neutral) if level < neutral else min(_NEUTRAL_RISE, level - neutral)
@@ -332,10 +336,10 @@ def jaw_opening(jaw: float, before: float, opening: float) -> tuple[float, float
 # --- The person -------------------------------------------------------------------------------------------------------
 
 Addressed = Literal["sense", "assume", "never"]
-OWN_VOICE_DB: Final = -50.0  # of full scale; what a program says is silent otherwise
+OWN_VOICE_DB: Final = -50.0  # relative to full scale; a program's voice is silent between words
 LOOK_S: Final = 0.25
 LOOKED, NOT_LOOKED = 0.6, 0.4
-LOST_FRAMES: Final = 25  # after so many without a face the look is unknown
+LOST_FRAMES: Final = 25  # after this many frames without a face the look is unknown
 _KEPT: Final = math.exp(-FRAME_S / LOOK_S)
 
 
@@ -345,11 +349,11 @@ class SenseMemory:
 
     Attributes:
         addressed: `Calmness.addressed`.
-        ear: of their voice.
+        ear: voice activity of their sound.
         deaf: there has been no sound at all.
-        attention: smoothed; None before any.
-        looked: 1, 0, or NaN for unknown.
-        unseen: frames since their face; None before the first.
+        attention: smoothed attention; None before any.
+        looked: whether they look: 1, 0, or NaN for unknown.
+        unseen: frames since their newest face; None before the first.
         tells: there has been an attention.
     """
 
@@ -366,16 +370,16 @@ class SenseMemory:
 
 @dataclass(frozen=True)
 class Sensed:
-    """Evidence (len(HEARD),) after the frame of that index in loop time."""
+    """Evidence `heard` (len(HEARD),) after the frame of index `frame` in loop time."""
 
     frame: int
     heard: Doubles
 
 
 def sense(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[Sensed, SenseMemory]:
-    """Take a frame; return its evidence and the memory after it.
+    """Process a frame; return its evidence and the memory after it.
 
-    Pure. Several streams of one speaker may share it if their `addressed` is the same.
+    A pure function. Several streams of one speaker may share the result if their `addressed` is the same.
     """
     deaf = memory.deaf and not len(speaker.audio)
     ear = memory.ear if deaf else voice_activity.step(energy_db(speaker.audio), memory.ear)
@@ -400,7 +404,7 @@ def sounds(own_voice: Floats | None) -> bool:
 
 
 def looks_at_head(speaker: SpeakerFrame, memory: SenseMemory) -> tuple[float, SenseMemory]:
-    """Return 1, 0 or NaN (unknown), and the memory after it."""
+    """Return 1 if the person looks at the head, else 0, or NaN (unknown); and the memory after the frame."""
     if memory.addressed != "sense":
         return float(memory.addressed == "assume"), memory
     given = speaker.attention

@@ -1,19 +1,20 @@
-"""When a listener nods, smiles, laughs, says "mm-hm", raises its brows, blinks, looks away: learned from people.
+"""Decisions of a listener to nod, smile, laugh, say "mm-hm", raise its brows, blink or look away: learned from people.
 
-    person's frame -> evidence -> log-odds of each kind (hazards) -> a number drawn falls below: event
+    person's frame -> evidence -> log-odds of each kind (hazards) -> a drawn number is below the probability: event
 
-A hazard is the chance of an event in the next 80 ms, as a sum of curves learned from people: log-odds are added, by
-name. `sim/listeners/events.yaml` holds them: of every kind an intercept and, per evidence (`events.evidence`), either a
-number that multiplies it or the values of a curve at its knots, between which it is straight over log(1 + seconds /
-0.2). A curve whose last value is 0 forgets. `gaze_shift` is the hazard of looking away from the person.
+A hazard is the probability of an event in the next 80 ms. Its log-odds are a sum of curves learned from people, one per
+named evidence. `sim/listeners/events.yaml` holds for every kind an intercept and, per evidence (`events.evidence`),
+either a factor of the evidence or the values of a curve at its knots; between knots it is straight over
+log(1 + seconds / 0.2). A curve whose last value is 0 has no effect after a long time. `gaze_shift` is the hazard of
+looking away from the person.
 
 Hazards are drawn every 80 ms. An event begins `LEAD_FRAMES` after it is decided, so that a plan made every fourth frame
-still shows its onset, and is never taken back. Nothing of the head happens inside a nod, a shake or a tilt; a head does
-not nod, laugh or say "mm-hm" while it speaks, or when no other person has spoken for two seconds. A smile that is
-returned takes its size from theirs.
+still shows its onset, and is never revoked. No other event of the head begins during a nod, a shake or a tilt; a head
+does not nod, laugh or say "mm-hm" while it speaks, or if no other person has spoken for two seconds. The size of a
+returned smile depends on that of the person.
 
-Laws: the same evidence and seed give the same events; a later frame changes nothing before; memory is never changed in
-place; hazards are finite whatever the input; more of a `Calmness` rate is never less of its hazard.
+Laws: the same evidence and seed lead to the same events; a later frame changes nothing before; memory is never changed
+in place; hazards are finite for any input; a higher rate in `Calmness` never lowers its hazard.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ from sfms_robot.signals.phase import log_time
 STEP_FRAMES: Final = 2
 STEP_S: Final = 0.08
 FILE: Final = "events.yaml"  # in sim/listeners
-_BOUND: Final = 30.0  # of log-odds
+_BOUND: Final = 30.0  # largest absolute log-odds
 _IS_NUMBER: Final = np.array([name in NUMBERS for name in EVIDENCE])
 
 Curve = Annotated[dict[NonNegative, Finite], Field(min_length=2)]
@@ -54,7 +55,7 @@ class Hazard(Model):
         learned_from: people whose events these are.
         per_minute: their rate, in the time in which the event may happen.
         intercept: log-odds of 80 ms without evidence.
-        weights: by evidence.
+        weights: factor or curve of each evidence, by name.
     """
 
     learned_from: str
@@ -77,10 +78,10 @@ class Shape(Model):
     """The distribution of durations and sizes, as evenly spaced quantiles from the least to the greatest.
 
     Attributes:
-        duration_s: of the whole event; of looking away, until the look back.
-        size: see `frames.ListenerEvent`; nods, shakes and tilts in degrees, a gaze shift too.
-        habit: quantiles of the factor of a stream's sizes; drawn once.
-        swings_hz: quantiles of the pace of nods and shakes; drawn once.
+        duration_s: duration of the whole event; for looking away, until the look back.
+        size: see `frames.ListenerEvent`; nods, shakes, tilts and gaze shifts in degrees.
+        habit: quantiles of the factor of a stream's sizes; drawn once per stream.
+        swings_hz: quantiles of the pace of nods and shakes; drawn once per stream.
     """
 
     duration_s: Quantiles
@@ -114,9 +115,9 @@ def load_tables(file: Path | None = None) -> EventTables:
 
 
 class HazardBank:
-    """All hazards at once, of one row of evidence or of many.
+    """All hazards, computed at once for one row of evidence or for many.
 
-    A curve is its first value plus slopes times the part of each interval between two knots that has passed; a number
+    A curve is its first value plus slopes times the part of each interval between two knots that has passed; a factor
     is one interval without ends.
     """
 
@@ -124,9 +125,9 @@ class HazardBank:
         self.kinds = tuple(hazards)
         self.terms = tuple(tuple(hazard.weights) for hazard in hazards.values())
         self._intercepts = np.array([hazard.intercept for hazard in hazards.values()])
-        self._first_term = np.cumsum([0, *map(len, self.terms)])  # of each kind
+        self._first_term = np.cumsum([0, *map(len, self.terms)])  # index of the first term of each kind
         base: list[float] = []  # first value of each term
-        first: list[int] = []  # interval of each term
+        first: list[int] = []  # index of the first interval of each term
         intervals: list[tuple[float, ...]] = []  # column of the evidence, first knot, least and most passed, slope
         for hazard in hazards.values():
             for name, weight in hazard.weights.items():
@@ -144,7 +145,7 @@ class HazardBank:
         self._column = column.astype(np.int64)
 
     def contributions(self, evidence: Doubles) -> Doubles:
-        """Return (..., T), the terms of the log-odds of each kind, of evidence (..., len(EVIDENCE)); NaN adds 0."""
+        """Return the terms (..., T) of each kind's log-odds, from evidence (..., len(EVIDENCE)); NaN adds 0."""
         axis = np.where(_IS_NUMBER, evidence, log_time(np.maximum(evidence, 0.0)))
         passed = np.minimum(np.maximum(axis[..., self._column] - self._knot, self._least), self._most)
         terms = self._base + np.add.reduceat(self._slope * passed, self._first, axis=-1)
@@ -165,11 +166,11 @@ class HazardBank:
 
 # --- Decisions --------------------------------------------------------------------------------------------------------
 
-LEAD_FRAMES: Final = 3  # an event decided with frame n begins behind frame n + LEAD_FRAMES
-LISTENING_S: Final = 2.0  # since another person spoke
+LEAD_FRAMES: Final = 3  # an event decided with frame n begins after frame n + LEAD_FRAMES
+LISTENING_S: Final = 2.0  # longest time since another person spoke
 _LISTENING: Final = ("silence_s", "own_voice_s", "phrase_s", "last_phrase_s", "others_smile_s")
 AT_PERSON: Final = (0.0, 0.0)
-# While one event of a group is under way no other of it begins.
+# While one event of a group is in progress, no other event of that group begins.
 GROUPS: Final = (
     frozenset(("nod", "shake", "tilt")),
     frozenset(("smile", "laugh")),
@@ -178,9 +179,9 @@ GROUPS: Final = (
     frozenset(("blink",)),
     frozenset(("gaze_shift",)),
 )
-ALWAYS: Final = frozenset(("blink", "gaze_shift"))  # the others only while listening
+ALWAYS: Final = frozenset(("blink", "gaze_shift"))  # the others begin only while listening
 SWINGING: Final = frozenset(("nod", "shake"))
-ANGLES: Final = frozenset(("nod", "shake", "tilt", "gaze_shift"))  # sizes are degrees
+ANGLES: Final = frozenset(("nod", "shake", "tilt", "gaze_shift"))  # their sizes in the tables are in degrees
 EXCLUDES: Final[Mapping[str, frozenset[str]]] = {
     kind: frozenset().union(*(group for group in GROUPS if kind in group)) for kind in EVENT_KINDS
 }
@@ -194,11 +195,11 @@ class EventMemory:
     """The memory of one stream.
 
     Attributes:
-        sensed: of the person.
-        seed, calmness: of the stream.
-        done: own events decided, in order, as far as they still matter.
-        hazards_hz: the last ones that were drawn, by kind: events a second if all evidence stayed the same; 0 while it
-            cannot happen.
+        sensed: memory of the person.
+        seed, calmness: seed and rates of the stream.
+        done: decided own events that still matter, in order.
+        hazards_hz: the last hazards that were drawn, by kind: events a second if all evidence stayed the same; 0 while
+            the event cannot happen.
     """
 
     sensed: SenseMemory
@@ -209,13 +210,13 @@ class EventMemory:
 
 
 class EventModel:
-    """The hazards and shapes that were learned; streams are values."""
+    """The learned hazards and shapes; streams are values (`EventMemory`)."""
 
     def __init__(self, tables: EventTables) -> None:
         self.tables = tables
         self.bank = HazardBank(tables.hazards)
         self.draws = [EVENT_KINDS.index(kind) for kind in self.bank.kinds]
-        self.asked_odds = lru_cache(maxsize=64)(self._asked_odds)  # asked for with every frame, by all streams
+        self.asked_odds = lru_cache(maxsize=64)(self._asked_odds)  # needed for every drawn frame of all streams
 
     @classmethod
     def load(cls, file: Path | None = None) -> EventModel:
@@ -234,7 +235,7 @@ class EventModel:
     def step_each(
         self, speakers: Sequence[SpeakerFrame], memories: Sequence[EventMemory]
     ) -> list[tuple[Events, EventMemory]]:
-        """Take a frame of 40 ms of each stream; return what it decides, and the memory after it. Pure."""
+        """Process a frame of 40 ms of each stream; return the decided events and the memory after it. Pure."""
         sensed = [sense(speaker, memory.sensed) for speaker, memory in zip(speakers, memories, strict=True)]
         decided = self.decide_each([one for one, _ in sensed], memories)
         return [(events, changed(own, sensed=heard)) for (events, own), (_, heard) in zip(decided, sensed, strict=True)]
@@ -244,7 +245,7 @@ class EventModel:
     ) -> list[tuple[Events, EventMemory]]:
         """Draw the hazards of several streams, all of them together: the second half of `step_each`.
 
-        A gaze shift away is followed by one back when its time is over.
+        A gaze shift away is followed by a shift back when its duration is over.
         """
         found: list[tuple[Events, EventMemory]] = [((), memory) for memory in memories]
         rows = [row for row, one in enumerate(sensed) if one.frame % STEP_FRAMES == STEP_FRAMES - 1]
@@ -261,7 +262,7 @@ class EventModel:
     def _drawn(
         self, sensed: Sensed, memory: EventMemory, log_odds: Doubles, terms: Doubles
     ) -> tuple[Events, EventMemory]:
-        """Return the events that are drawn, of log-odds (H,) as learned, and their terms (T,)."""
+        """Return the events drawn from learned log-odds (H,) and their terms (T,), and the memory after them."""
         now_s = (sensed.frame + 1) * FRAME_S
         odds = [own + more for own, more in zip(log_odds.tolist(), self.asked_odds(memory.calmness), strict=True)]
         may = _may_happen(sensed, memory.done, now_s)
@@ -286,7 +287,7 @@ class EventModel:
         return tuple(events), changed(memory, done=kept, hazards_hz=hazards)
 
     def _asked_odds(self, calmness: Calmness) -> list[float]:
-        """Return what requested rates add to the log-odds of each kind without `log_rate` among its evidence."""
+        """Return the log-odds that requested rates add to each kind; 0 for kinds with `log_rate` in their evidence."""
         learned = self.tables.hazards
         return [
             math.log(asked / learned[kind].per_minute)
@@ -304,7 +305,7 @@ class EventModel:
         return (ListenerEvent("gaze_shift", _begin_s(frame), until_s, shift.size, target_rad=AT_PERSON),)
 
     def shaped(self, kind: str, frame: int, seed: int) -> ListenerEvent:
-        """Draw the duration, size and direction of an event; no larger than a head can get within a swing."""
+        """Draw the duration, size and direction of an event, at most as large as a head can reach within a swing."""
         shape = self.tables.shapes[kind]
         part = EVENT_KINDS.index(kind)
         long, large, side, up = uniforms(seed, frame, Use.COURSE, 4, part).tolist()
@@ -340,7 +341,7 @@ def _may_happen(sensed: Sensed, history: Events, now_s: float) -> frozenset[str]
     silence_s, own_s, phrase_s, last_s, smile_s = (sensed.heard.item(AT[name]) for name in _LISTENING)
     listening = silence_s <= LISTENING_S and own_s > 0 and not (math.isnan(phrase_s) and math.isnan(last_s))
     possible = ALWAYS if not listening else frozenset(EVENT_KINDS)
-    if smile_s <= LISTENING_S and own_s > 0:  # a smile is returned to a person who is silent too
+    if smile_s <= LISTENING_S and own_s > 0:  # a smile is returned to a silent person too
         possible |= {"smile"}
     under_way = {event.kind for event in history if event.end_s > now_s and event.kind != "gaze_shift"}
     shift = last_shift(history)

@@ -1,7 +1,7 @@
-"""Tokens of a stream: its window of past and future, and how the undecided ones are drawn. numpy only. Ours.
+"""Tokens of a stream: its window of past and future, and the drawing of undecided tokens. numpy only. Ours.
 
 The paper predicts 8 frames and stops there. A robot does not: plans overlap, keyframes that were drawn stay, and an
-event that is decided meanwhile may call some of them off. A token is 0 at a transition, 1 + i at a keyframe of code i,
+event that is decided meanwhile may revoke some of them. A token is 0 at a transition, 1 + i at a keyframe of code i,
 UNDECIDED where it is not drawn yet. B streams, P past and H future frames, T = P + H, G groups, V codes, K columns.
 """
 
@@ -26,15 +26,15 @@ Tokens = Ints
 A = TypeVar("A")  # an array or a tensor
 
 UNDECIDED: Final = -1
-KEPT_FRAMES: Final = 1  # of the future, whatever is decided: servos are already moving there
+KEPT_FRAMES: Final = 1  # future frames that no event revokes: servos are already moving there
 SAME: Final = 1e-5  # control rows that differ by less are the same
 KEYS_STEP: Final = 8
 NEUTRAL_STRIDE: Final = 8  # frames between the keyframes of the neutral face a stream begins with
-LIKELIEST: Final = 128  # classes that may be drawn: all others together weigh next to nothing
+LIKELIEST: Final = 128  # number of classes that may be drawn: all others together have next to no probability
 
 # --- The window of a stream -------------------------------------------------------------------------------------------
 #
-# H = 8, hop 4, the plan made when frame 100 has been heard. k: keyframe, .: transition, U: undecided.
+# H = 8, hop 4, the plan made after frame 100 has come. k: keyframe, .: transition, U: undecided.
 #
 #     frame          61       ...        98   99  100 | 101  102  103  104 | 105  106  107  108
 #                    past (P = 40), shown             | kept of the plan   | free
@@ -44,15 +44,16 @@ LIKELIEST: Final = 128  # classes that may be drawn: all others together weigh n
 #                                                  ^
 #                                                  settled: the last frame whose motion is fixed
 #
-# - `passed`: four frames later the same tokens stand four places further left, and four undecided ones follow. With
-#   penalised placement, where a keyframe holds until the next one, one that leaves the window stays at its first frame.
+# - `passed`: four frames later the same tokens are four places further left, and four undecided ones follow. With
+#   penalised placement, where a keyframe holds until the next one, the last keyframe that has left the window is put at
+#   the window's first frame.
 # - `revoked`: an event is decided that changes the control row of frame 103. Tokens of 103 to 108 become undecided and
-#   are drawn again, whatever the hop; settled is 102. Frame 101 (KEPT_FRAMES) is never called off.
+#   are drawn again, whatever the hop; settled is 102. Frame 101 (KEPT_FRAMES) is never revoked.
 # - `anchored`: the keyframe just drawn at 106 has a ramp of 5 frames, which would begin at 101; but settled is 102,
-#   and motion up to there did not know of the keyframe. So the last keyframe of the group is repeated at 102, and the
+#   and motion up to there was made without the keyframe. So the last keyframe of the group is repeated at 102, and the
 #   ramp begins there. Without it, a nod would begin before the time that it was decided for.
 #
-# Motion behind the last keyframe is an extrapolation, which the next plan may correct (`stream.join`).
+# Motion after the last keyframe is an extrapolation, which the next plan may correct (`stream.join`).
 
 
 class LastKeyframes(NamedTuple, Generic[A]):
@@ -63,7 +64,7 @@ class LastKeyframes(NamedTuple, Generic[A]):
 
 
 class Context(NamedTuple, Generic[A]):
-    """Inputs of the predictor, arrays or tensors, in the order in which the network `ahead` takes them.
+    """Inputs of the predictor, arrays or tensors, in the order of the inputs of the network `ahead`.
 
     Attributes:
         face: (B, P, C) speaker's standardised motion; arbitrary where not `face_known`.
@@ -73,7 +74,7 @@ class Context(NamedTuple, Generic[A]):
         phase: (B, P, F) the speaker's place in a phrase; arbitrary where not `heard`; F = 0 without.
         tokens: (B', P + H, G) the listener's own: past, the part of the future that is drawn already, UNDECIDED.
             B' = B, or any number when B = 1: many answers to one speaker.
-        control: (B', P + H, K) events in each of those frames; K = 0 without.
+        control: (B', P + H, K) events in each of those frames; K = 0 without events.
     """
 
     face: A
@@ -89,11 +90,11 @@ def last_keyframes(tokens: Tokens) -> LastKeyframes[Tokens]:
     """Return the last keyframes at every frame of tokens (B, T, G), that frame included; frame -1 for none."""
     windows, frames, groups = tokens.shape
     window, group = np.arange(windows)[:, None, None], np.arange(groups)
-    # One frame is put before all others, without a keyframe: the index of those that have none yet.
+    # One frame without a keyframe is put before all others: its index is for frames that have no keyframe yet.
     known = np.zeros((windows, frames + 1, groups), tokens.dtype)
     np.maximum(tokens, 0, out=known[:, 1:])
     last = np.maximum.accumulate(np.where(known > 0, np.arange(frames + 1)[:, None], 0), axis=1)
-    before = np.concatenate([last[:, :1], last[:, :-1]], axis=1)[window, last, group]  # as of the frame before
+    before = np.concatenate([last[:, :1], last[:, :-1]], axis=1)[window, last, group]  # the keyframe before the last
     at = np.stack([last, before], axis=-1)[:, 1:]
     return LastKeyframes(known[window[..., None], at, group[:, None]], at - 1)
 
@@ -108,8 +109,8 @@ def with_drawn(recent: LastKeyframes[Tokens], drawn: Tokens, frame: int) -> Last
 def around(tokens: Tokens) -> tuple[NDArray[Any], ...]:
     """Return the parts of `piecewise_linear.Around` of tokens (B, T, G): the keyframes around each frame.
 
-    A window without keyframes looks at all of its frames. K is as large as the fullest window needs, rounded up to
-    whole `KEYS_STEP`s, because engines prepare themselves for every K that they meet.
+    A window without keyframes attends to all of its frames. K is as large as the fullest window needs, rounded up to a
+    multiple of `KEYS_STEP`, because engines have to prepare for every new K.
     """
     windows, frames, _ = tokens.shape
     key, frame = tokens > 0, np.arange(frames)[:, None]
@@ -132,10 +133,10 @@ def neutral_mask(frames: int, groups: int) -> Floats:
 
 
 def passed(tokens: Tokens, path: Floats, frames: int, holds: bool = False) -> tuple[Tokens, Floats]:
-    """Return tokens (B, P + H, G) and path (B, 2 + H, C) of `frames` later.
+    """Return tokens (B, P + H, G) and path (B, 2 + H, C) moved on by `frames`.
 
-    What passed undecided, before the first plan, was the neutral face: transitions. `holds`: the last keyframe that has
-    left the window is put at its first frame.
+    Tokens that passed undecided, before the first plan, were the neutral face: they become transitions. `holds`: the
+    last keyframe that has left the window is put at the window's first frame.
     """
     horizon = path.shape[1] - 2
     moved = np.concatenate([tokens[:, frames:], np.full_like(tokens[:, :frames], UNDECIDED)], axis=1)
@@ -146,17 +147,17 @@ def passed(tokens: Tokens, path: Floats, frames: int, holds: bool = False) -> tu
 
 
 def later(control: Floats, frames: int = 1) -> Floats:
-    """Return control (B, P + H, K) of `frames` later; 0 for frames that no row has been given for yet."""
+    """Return control (B, P + H, K) moved on by `frames`; 0 for frames that have no row yet."""
     return np.concatenate([control[:, frames:], np.zeros_like(control[:, :frames])], axis=1)
 
 
 def revoked(tokens: Tokens, drawn_under: Floats, control: Floats, horizon: int) -> tuple[Tokens, Tokens]:
-    """Return tokens (B, P + H, G) without the future ones that new control rows have overtaken, and `settled` (B,).
+    """Return tokens (B, P + H, G), undecided from the first future control row that changed, and `settled` (B,).
 
     Args:
-        tokens: of the window.
-        drawn_under: (B, P + H, K) control rows that the tokens were drawn under.
-        control: (B, P + H, K) control rows of now.
+        tokens: tokens of the window.
+        drawn_under: (B, P + H, K) control rows with which the tokens were drawn.
+        control: (B, P + H, K) current control rows.
         horizon: H.
     """
     changed = (np.abs(control - drawn_under)[:, -horizon:] > SAME).any(-1)
@@ -171,7 +172,7 @@ def revoked(tokens: Tokens, drawn_under: Floats, control: Floats, horizon: int) 
 def anchored(tokens: Tokens, drawn: Bools, settled: Tokens, ramp: int) -> Tokens:
     """Return tokens (B, T, G) in which no ramp to a keyframe just `drawn`, (B, T, G), begins before frame `settled`.
 
-    `settled`: (B,). There the keyframe that a group held until then is repeated.
+    At frame `settled` (B,) the keyframe that a group held until then is repeated.
     """
     stream, frame = np.arange(len(tokens)), np.arange(tokens.shape[1])
     new, out = drawn & (tokens > 0), tokens.copy()
@@ -186,21 +187,21 @@ def anchored(tokens: Tokens, drawn: Bools, settled: Tokens, ramp: int) -> Tokens
 
 # --- Reach ------------------------------------------------------------------------------------------------------------
 #
-# How soon one keyframe may follow another: no channel moves faster than it ever did in the training motion. Frames
-# are drawn one at a time from probabilities that never quite reach zero; without this rule two codes far apart may
-# end up in neighbouring frames, which no head can follow and no face does.
+# The least number of frames between two keyframes: no channel may move faster than it ever did in the training motion.
+# Frames are drawn one at a time from probabilities that never quite reach zero; without this rule two codes far apart
+# may end up in neighbouring frames, which no head can follow and no face does.
 
 NEVER = 255  # frames, more than any window has
-TINY = 1e-9  # for a channel that never moved
+TINY = 1e-9  # speed of a channel that never moved
 
 
 class CodeReach:
-    """Frames needed from each token to each other one, per group. A row is computed when it is first asked for.
+    """Frames needed from each token to each other token, per group. A row is computed when it is first needed.
 
     Args:
-        settings: of the listener. Without `sampling.reach` every code may follow every other at once; a group still
-            never gets a code that it lacks.
-        motion: (V, C) motion of every code, V of the largest group; the codes of a smaller one are its first.
+        settings: settings of the listener. Without `sampling.reach` every code may follow every other at once; a group
+            still never gets a code that it lacks.
+        motion: (V, C) motion of every code, V of the largest group; the codes of a smaller group are the first ones.
         speed: (C,) fastest natural change of each channel from one frame to the next.
     """
 
@@ -217,7 +218,7 @@ class CodeReach:
     def too_soon(self, last: Tokens, gap: Tokens) -> Bools:
         """Return the classes (B, G, V + 1) out of reach `gap` (B, G) frames after the last keyframes (B, G)."""
         needed = np.concatenate([self._needed(*each) for row in last.tolist() for each in enumerate(row)])
-        passed = np.minimum(gap, NEVER - 1).astype(np.uint8)  # as wide as what it is compared with
+        passed = np.minimum(gap, NEVER - 1).astype(np.uint8)  # the type of `needed`
         return needed.reshape(*last.shape, self._classes) > passed[..., None]
 
     def _needed(self, group: int, token: int) -> NDArray[np.uint8]:
@@ -239,22 +240,22 @@ class CodeReach:
 
 # --- Courses of events ------------------------------------------------------------------------------------------------
 #
-# A smile or a nod in the control rows moves as people's do: the tokens drawn for it lie near the course of an event
+# A smile or a nod in the control rows moves as people's do: the tokens drawn for it are near the course of an event
 # of its size.
 #
-# Both are rare, so a small predictor learns that one is under way better than how far it has to go by now: alone it
-# raises the corners of a mouth too little, at any time within a second, and makes one short nod in four hardly at
-# all. While one is under way, each class of its group loses what a normal distribution around the course takes from
-# it,
+# Both are rare, so a small predictor learns that an event is in progress better than how far it has to be by now. Alone
+# it raises the corners of a mouth too little, at any time within a second, and hardly makes one short nod in four.
+# While an event is in progress, the log-odds of each class of its group are reduced as by a normal distribution around
+# the course,
 #
 #     log p  -=  (value - course)^2 / (2 spread^2),
 #
-# where the value is that of the code, or, for the transition, that of the keyframe that is held. So a keyframe comes
-# when the held one has left the course, and of the codes those that fit are likely; the predictor still decides which
-# of them, and what else the group does. Without an event nothing changes.
+# where the value is that of the code, or, for the transition, that of the keyframe that is held. So a keyframe is
+# drawn when the held one has left the course, and codes that fit the course are likely; the predictor still decides
+# which of them it is, and the other motion of the group. Without an event nothing changes.
 #
-# A smile has a course all along: corners that rise, and fall before its end; a laugh, which is larger, has none. A
-# nod has one where its swings turn, at the lowest point of each and between them; the way there is free.
+# A smile has a course at all times: corners that rise, and fall before its end; a laugh, which is larger, has none. A
+# nod has a course where its swings turn, at the lowest point of each and between them; the motion in between is free.
 
 _AT: Final = {name: at for at, name in enumerate(COLUMNS)}
 _TURN: Final = 2 * math.pi
@@ -270,13 +271,13 @@ class Course(NamedTuple):
 
 @dataclass(frozen=True)
 class EventCourse:
-    """A course that one group keeps to.
+    """A course that the tokens of one group follow.
 
     Attributes:
-        how: its shape.
+        how: shape of the course.
         group: place among the groups.
-        values: (V,) of each of the group's codes, in the unit of the course: radians nose down of a nod, 0 to 1 of a
-            smile.
+        values: (V,) value of each of the group's codes, in the unit of the course: radians nose down for a nod, 0 to 1
+            for a smile.
     """
 
     how: SmileCourse | NodCourse
@@ -284,16 +285,16 @@ class EventCourse:
     values: Doubles
 
     def course(self, control: Floats) -> Course | None:
-        """Return the course (..., T) in rows (..., T, K) of control, in their order; None without such an event."""
+        """Return the course (..., T) in consecutive control rows (..., T, K); None without such an event."""
         if isinstance(self.how, SmileCourse):
             return smile_course(self.how, control) if control[..., _AT["smile.active"]].any() else None
         return nod_course(self.how, control) if control[..., _AT["nod.active"]].any() else None
 
     def penalties(self, wanted: Doubles, spread: Doubles, last: Tokens) -> tuple[Indices, Floats]:
-        """Return which streams (S,) have a course in this frame, and the log-odds (S, V + 1) that each class loses.
+        """Return the streams (S,) that have a course in this frame, and the log-odds (S, V + 1) that each class loses.
 
         Args:
-            wanted, spread: (B,) a row of `course`.
+            wanted, spread: (B,) the course of this frame.
             last: (B,) last keyframes of the group, 0 for none.
         """
         streams = np.flatnonzero(np.isfinite(wanted))
@@ -310,34 +311,34 @@ def smile_course(smile: SmileCourse, control: Floats) -> Course:
     since = since_s(control[..., _AT["smile.since"]])
     over = control[..., _AT["smile.over"]].astype(np.float64)  # the share of its duration that has passed
     left = np.where(over > 0, since * (1 / np.maximum(over, 1e-6) - 1), np.inf)
-    # Of its size a smile has as much as it has risen, and no more than is left of its fall.
+    # A smile has the share of its size that it has risen to, and no more than is left of its fall.
     share = np.minimum(np.interp(since, smile.RISE_S, smile.rise), np.interp(left, smile.FALL_S, smile.fall))
     wanted = np.where(told, control[..., _AT["smile.size"]] * share, np.nan)
     return Course(wanted, np.full_like(wanted, smile.spread))
 
 
 def nod_course(nod: NodCourse, control: Floats) -> Course:
-    """Return the course of the pitch, radians: in the two rows about the middle of each swing and next to its end."""
+    """Return the course of the pitch [rad]: in the two rows around the middle of each swing and next to its end."""
     told = control[..., _AT["nod.active"]] > 0
     size = control[..., _AT["nod.size"]].astype(np.float64) * FULL_SIZE["nod"]
     turned, step = _turned(control, told)
     ended = np.zeros_like(told)
-    ended[..., 1:] = ~told[..., 1:] & told[..., :-1]  # the row behind the last one may lie nearest to the end
+    ended[..., 1:] = ~told[..., 1:] & told[..., :-1]  # the row after the last one may be nearest to the end
     for values, more in ((turned, step), (size, 0.0), (step, 0.0)):
         values[..., 1:] = np.where(ended[..., 1:], (values + more)[..., :-1], values[..., 1:])
     swing, angle = np.divmod(turned, _TURN)
     low = (told | ended) & (np.abs(angle - math.pi) <= step)
     back = (told | ended) & (np.minimum(angle, _TURN - angle) <= step / 2) & (turned > math.pi)
     off = angle - math.pi
-    nearest = off - step * np.round(off / np.maximum(step, _LEAST_RAD))  # of the rows, to the middle
-    # A swing is size (1 - cos angle) / 2, scaled so that the row nearest to its middle reaches all of it.
+    nearest = off - step * np.round(off / np.maximum(step, _LEAST_RAD))  # offset of the nearest row from the middle
+    # A swing is size (1 - cos angle) / 2, scaled so that the row nearest to its middle reaches the whole size.
     there = size * nod.fall**swing * (1 + np.cos(off)) / np.maximum(1 + np.cos(nearest), _LEAST_RAD)
     wanted = np.where(low, there, np.where(back, 0.0, np.nan))
     return Course(wanted, nod.spread * np.maximum(size, _LEAST_RAD))
 
 
 def _turned(control: Floats, told: Bools) -> tuple[Doubles, Doubles]:
-    """Return how far the swings of a nod have turned since its beginning, and the step from row to row, in radians.
+    """Return the angle that the swings of a nod have turned so far, and its step from row to row, in radians.
 
     The step is 0 where only one row of the nod is known.
     """
@@ -348,7 +349,7 @@ def _turned(control: Floats, told: Bools) -> tuple[Doubles, Doubles]:
     step = np.zeros_like(angle)
     step[..., 1:] = ahead
     step[..., :-1] = np.where(same, ahead, step[..., :-1])
-    whole = np.round((since / FRAME_S * step - angle) / _TURN)  # turns before this one
+    whole = np.round((since / FRAME_S * step - angle) / _TURN)  # complete turns before this one
     return angle + _TURN * whole, step
 
 
@@ -356,10 +357,10 @@ def _turned(control: Floats, told: Bools) -> tuple[Doubles, Doubles]:
 
 
 class Sampler:
-    """Draws the tokens of one listener: frame by frame, every group at once, many streams at a time."""
+    """A sampler of the tokens of one listener: frame by frame, every group at once, many streams at a time."""
 
     def __init__(self, settings: config.Sfms, engine: Engine, codes: Floats, courses: Sequence[EventCourse]) -> None:
-        """Take the motion (V, C) of every code, and the courses that it keeps to."""
+        """Create a sampler from the motion `codes` (V, C) of every code, and the courses to follow."""
         groups, common = list(settings.groups.values()), settings.sampling
         self._engine, self._courses = engine, courses
         self._reach = CodeReach(settings, codes, engine.tensors["motion_speed"])
@@ -374,8 +375,8 @@ class Sampler:
         Args:
             seen: undecided frames are the last ones of a stream; how many may differ from stream to stream.
             settled: (B,) the last frame of each window whose motion is fixed: no new ramp begins before it.
-            seeds: of each stream.
-            frames: the number, in the life of each stream, of the last frame of its window.
+            seeds: seed of each stream.
+            frames: number of the last frame of each window, counted since the stream began.
         """
         tokens = seen.tokens.copy()
         window = tokens.shape[1]
@@ -383,7 +384,7 @@ class Sampler:
         recent = last_keyframes(tokens)
         (slots,) = self._engine.run("ahead", *seen, *recent)
         last = LastKeyframes(recent.tokens[:, first - 1], recent.at[:, first - 1])
-        before = min(first, 2)  # rows that say how fast a swing is, and that it has just ended
+        before = min(first, 2)  # earlier rows, which show the pace of a swing, and that it has just ended
         rows = seen.control[:, first - before :]
         courses = [(told, one) for told in self._courses if (one := told.course(rows)) is not None]
         for frame in range(first, window):
@@ -408,7 +409,7 @@ class Sampler:
 
 
 def by_group(flat: Floats, classes: Sequence[int]) -> Floats:
-    """Return logits (..., G, V) of (..., all classes of all groups), `classes` of each; -inf for those it lacks."""
+    """Return logits (..., G, V) of (..., all classes of all groups), `classes` of each group; -inf for missing ones."""
     out = np.full((*flat.shape[:-1], len(classes), max(classes)), -np.inf, np.float32)
     first = 0
     for group, count in enumerate(classes):
@@ -434,7 +435,7 @@ def sample(logits: Floats, bias: Floats, nucleus: np.float32, chance: Doubles) -
     point = chance.reshape(-1) * mass[row, kept - 1]
     place = np.minimum((mass <= point[:, None]).sum(-1), kept - 1)
     value = values[row, place][:, None]
-    alike = shares == value  # mostly that class alone; of several the first ones come first
+    alike = shares == value  # mostly one class; if there are several, the first ones come first
     before = place - (values > value).sum(-1)
     drawn: Tokens = (alike.cumsum(-1) > before[:, None] if before.any() else alike).argmax(-1)
     return drawn.reshape(logits.shape[:-1])

@@ -1,4 +1,4 @@
-"""Both phases of SFMS as one model: the tokenizer (IV-B), the predictor of its tokens (IV-C), and what a stream calls.
+"""Both phases of SFMS as one model: tokenizer (IV-B), predictor of its tokens (IV-C), and the networks of a stream.
 
     Inpainter    sparse to dense (IV-B5): keyframes -> every frame
     Tokenizer    motion <-> tokens (IV-B): placement, codes, inpainter
@@ -35,7 +35,7 @@ from sfms_robot.listeners.sfms.predictor import Predictor
 from sfms_robot.listeners.sfms.quantizer import Quantizer
 from sfms_robot.listeners.space import MotionSpace
 
-UNMEASURED = 1e6  # deviations a frame: a speed that does not bound anything
+UNMEASURED = 1e6  # deviations per frame: a speed that does not bound anything
 
 # --- Sparse to dense (IV-B5) ------------------------------------------------------------------------------------------
 #
@@ -83,7 +83,7 @@ class Inpainter(nn.Module):
         if around is None:
             neighbours = Neighbours.in_mask(mask, self.ramp)
             seen = (mask > 0.5).any(-1)  # every frame is looked up, so that learned placement gets its gradient
-            seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe looks at its blanks
+            seen = seen | ~seen.any(-1, keepdim=True)  # a window without any keyframe attends to all its frames
         else:
             neighbours = Neighbours.at(around.before, around.after, self.ramp)
             seen = around.seen
@@ -91,7 +91,7 @@ class Inpainter(nn.Module):
         # Multiplying by the mask changes nothing going forward; it is where learned placement gets its gradient.
         keyed = codes * mask[..., None]
         z_kf = self.keyframe_in(torch.cat([keyed, mask[..., None]], dim=-1).flatten(2)) + places  # (B, T, W)
-        # (B, K, W): the keyframes of each window, in a row; other frames are not looked at and not kept.
+        # (B, K, W): the keyframes of each window, in a row; other frames are not attended to and not kept.
         z_keys = z_kf if around is None else F.embedding(around.rows, z_kf.flatten(0, 1))
         for block in self.keyframe_encoder:
             z_keys = block(z_keys, seen=seen)
@@ -115,7 +115,7 @@ class Inpainter(nn.Module):
 
 
 class Tokenizer(nn.Module):
-    """Motion <-> tokens (B, T, G): 0 at a transition frame, 1 + code index at a keyframe. Motion is standardised."""
+    """A map of standardised motion <-> tokens (B, T, G): 0 at a transition frame, 1 + code index at a keyframe."""
 
     def __init__(self, settings: config.Sfms) -> None:
         super().__init__()
@@ -131,7 +131,7 @@ class Tokenizer(nn.Module):
         self.member = nn.Buffer(torch.tensor(member), persistent=False)  # (G, C)
         self.quantizer = Quantizer(self.member, settings)
         self.inpainter = Inpainter(self.quantizer, settings)
-        # Only learned placement has scores to learn; the others carry no dead weights.
+        # Only learned placement has scores to learn; the other strategies have no unused weights.
         self.score: ScoreNetwork | ConditionalScore | None = None
         if settings.placement in ("learned_paper", "adaptive"):
             self.score = ScoreNetwork(len(settings.channels), len(groups), settings.scores)
@@ -141,11 +141,11 @@ class Tokenizer(nn.Module):
     def place(self, motion: Tensor, keyframes: Sequence[int] | None = None, strategy: Strategy | None = None) -> Tensor:
         """Return the mask (B, T, G) of motion (B, T, C).
 
-        `keyframes` (per group) and `strategy` replace the configured ones; those are scaled to the length of the
-        motion.
+        `keyframes` (per group) and `strategy` replace the configured ones; the configured keyframes are scaled to the
+        length of the motion.
         """
         frames = motion.shape[1]
-        # k of IV-B2 is of a window; a longer stretch gets as many a second.
+        # k of IV-B2 is for one window; a longer stretch gets as many per second.
         scaled = [max(1, round(count * frames / self.window)) for count in self.keyframes]
         return place(
             motion,
@@ -153,7 +153,7 @@ class Tokenizer(nn.Module):
             strategy or self.strategy,
             member=self.member,
             score=self.score,
-            # A bound on gaps is made for the configured rate; fewer keyframes could not keep it.
+            # The bound on gaps is for the configured rate; fewer keyframes could not keep it.
             max_gap=self.max_gap if frames >= self.window and keyframes is None else None,
             sweeps=self.settings.scores.sweeps,
             costs=self.costs,
@@ -171,7 +171,7 @@ class Tokenizer(nn.Module):
         `last`, `around`: see `Inpainter`.
         """
         # Class 0 is the transition frame, class 1 + i the code c_i of the codebook D (IV-C2).
-        codes = self.quantizer.codebook.codes((tokens - 1).clamp(min=0))  # of transitions: any
+        codes = self.quantizer.codebook.codes((tokens - 1).clamp(min=0))  # arbitrary for transitions
         out: Tensor = self.inpainter(codes, (tokens > 0).float(), self.quantizer, last, around)
         return out
 
@@ -200,7 +200,7 @@ class Rest(Network[SfmsModel]):
     """A still face as tokens, and every code as motion: called once, when a listener is loaded."""
 
     def forward(self, still: Tensor, mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Return tokens (1, P, G) of still (1, P, C) with keyframes mask (1, P, G), and motion (1, V, C) of codes."""
+        """Return tokens (1, P, G) of `still` (1, P, C) with keyframes `mask` (1, P, G), motion (1, V, C) of codes."""
         quantizer, place = self.model.tokenizer.quantizer, still.device
         codes = [group.codes for group in self.model.settings.groups.values()]
         indices = torch.arange(max(codes), device=place)[:, None] % torch.tensor(codes, device=place)
@@ -211,7 +211,7 @@ class Hear(Network[SfmsModel]):
     """Sound of a frame and of the one before it, for the predictor."""
 
     def forward(self, rows: Tensor) -> tuple[Tensor]:
-        """Return the newer frame (B, W) of standardised rows (B, 2R, bins)."""
+        """Return the vector (B, W) of the newer frame of standardised rows (B, 2R, bins)."""
         return (self.model.predictor.speaker.listen(rows)[:, 0],)
 
 

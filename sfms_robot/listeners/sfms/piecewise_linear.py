@@ -1,12 +1,12 @@
 """Straight lines between keyframes: the values on them, their errors, and the masks with the least error.
 
 `Neighbours` are the keyframes before and after each frame; the inpainter interpolates between them, and so does every
-error here: a line between two keyframes, held before the first and behind the last. `Segments` are the squared errors
+error here: a line between two keyframes, held before the first and after the last. `Segments` are the squared errors
 of all stretches between two keyframes. The error of a mask is the sum over its stretches, so the best mask is a
 cheapest path, found by dynamic programming: of k keyframes (`best_frames`), of 1..K keyframes through given frames
-(`completion_errors`), or of as many as pay for themselves (`place_penalised`).
+(`completion_errors`), or of those that each save more error than they cost (`place_penalised`).
 
-All of this is ours, because a learned placement (IV-B2) needs a measure of how good it is; the paper compares with
+All of this is ours, because the quality of a learned placement (IV-B2) has to be measured; the paper compares with
 even spacing alone.
 """
 
@@ -29,10 +29,10 @@ class Around(NamedTuple):
     """Keyframes in tokens (B, T, G), as `draw.around` finds them before a network sees the tokens.
 
     Attributes:
-        before, after: (B, T, G) as `Neighbours.at` takes them.
+        before, after: (B, T, G) as for `Neighbours.at`.
         rows: (B, K) frames that hold a keyframe of any group, as rows of (B * T).
-        seen: (B, K) which of those count; the others fill up K.
-        places: (B, T) place of each frame among them, as a row of (B * K); arbitrary for other frames.
+        seen: (B, K) which of `rows` count; the others fill up K.
+        places: (B, T) place of each such frame in `rows`, as a row of (B * K); arbitrary for other frames.
     """
 
     before: Tensor
@@ -52,17 +52,17 @@ def nearest_keys(mask: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, kw_only=True)
 class Neighbours:
-    """For every frame and group the keyframe before (or at) it and the one after.
+    """For every frame and group, the keyframe before (or at) it and the keyframe after it.
 
-    Before the first and behind the last keyframe the nearest one is held.
+    Before the first and after the last keyframe the nearest one is held.
 
     Attributes:
         frame: (T, 1) number of each frame.
-        before, after: (B, T, G) frames of the two.
+        before, after: (B, T, G) frames of the two keyframes.
         has_before, has_after: (B, T, G) bool.
         ramp: a line to a keyframe begins at most this many frames before it, and the keyframe before is held until
-            then; None: a line all the way, the paper's. Ours, because a stream draws its keyframes a few frames ahead:
-            a line that begins earlier would jump when its end is drawn.
+            then; None: a line all the way, as in the paper. Ours, because a stream draws its keyframes a few frames
+            ahead: a line that begins earlier would jump when its end is drawn.
     """
 
     frame: Tensor
@@ -93,7 +93,7 @@ class Neighbours:
         )
 
     def last(self, frames: int) -> Neighbours:
-        """Return those of this many frames at the end alone."""
+        """Return the neighbours of only the last `frames` frames."""
         return Neighbours(
             before=self.before[:, -frames:],
             after=self.after[:, -frames:],
@@ -115,21 +115,21 @@ class Neighbours:
 
     @cached_property
     def weight(self) -> Tensor:
-        """Return the weight (B, T, G) of the keyframe after: 0 at the one before, 1 at the one after."""
+        """Return the weight (B, T, G) of the keyframe after: 0 at the keyframe before, 1 at the keyframe after."""
         # Share of the way from the keyframe before (0) to the one after (1); held until the ramp begins.
         begin = self.before if self.ramp is None else torch.maximum(self.before, self.after - self.ramp)
         span = (self.after - begin).clamp(min=1)
         return ((self.frame - begin) / span).clamp(0.0, 1.0)
 
     def interpolate(self, values: Tensor) -> Tensor:
-        """Return (B, T, G, D) on the lines between values (B, S, G, D) at keyframes; T are the frames in here."""
+        """Return (B, T, G, D) on the lines between values (B, S, G, D) at keyframes, for the T frames of `frame`."""
         index = [i[..., None].expand(-1, -1, -1, values.shape[-1]) for i in (self.before, self.after)]
         first, second = (values.gather(1, i) for i in index)
         return first + (second - first) * self.weight[..., None]
 
     def positions(self) -> Tensor:
         """Return binary sliding positions (B, T, G, 2 * bits + 3): T^tf of equation (10)."""
-        # IV-B5: T^tf as a binary vector, so that one frame more changes the input clearly; ours: to both neighbours.
+        # IV-B5: T^tf as a binary vector, so that one more frame changes the input clearly; ours: to both neighbours.
         powers = 2 ** torch.arange(POSITION_BITS, device=self.before.device)
         bits = (torch.stack([self.since, self.until], dim=-1)[..., None] & powers) > 0
         ends = torch.stack([self.has_before.to(self.weight), self.has_after.to(self.weight), self.weight], dim=-1)
@@ -152,7 +152,7 @@ class Segments(NamedTuple):
     after: Tensor
 
     def through(self, chosen: Tensor) -> Segments:
-        """Return these without stretches that pass over any of the `chosen` frames (N, T)."""
+        """Return the errors with infinity for stretches that pass over any of the `chosen` frames (N, T)."""
         seen = chosen.cumsum(-1)  # chosen frames up to and including t
         ahead = seen - chosen
         passed = ahead[:, None, :] - seen[:, :, None] > 0.5  # strictly between i and j
@@ -212,7 +212,7 @@ def completion_errors(cost: Segments, chosen: Tensor, most: int) -> Tensor:
 
 def mask_cost(cost: Segments, mask: Tensor) -> Tensor:
     """Return the error (N,) of a mask (N, T): the sum over its stretches, infinite for a mask without keyframes."""
-    # Each keyframe pays for the stretch that ends with it, the last one for the frames behind it too.
+    # Each keyframe counts the error of the stretch that ends with it, the last one also that of the frames after it.
     key, last = mask > 0.5, nearest_keys(mask)[0]
     previous = F.pad(last[:, :-1], (1, 0), value=-1)
     between = cost.inside.gather(1, previous.clamp(min=0)[:, None])[:, 0]
@@ -224,10 +224,10 @@ def mask_cost(cost: Segments, mask: Tensor) -> Tensor:
 
 # --- As many keyframes as pay for themselves --------------------------------------------------------------------------
 #
-# The paper gives every window the same number of keyframes. Motion far away then decides about keyframes here: a nod
-# takes them from the stillness around it and from the next second's smile. With a cost per keyframe, one stands where
-# it saves more than its cost, wherever the others stand: none in stillness except those that `max_gap` requires, many
-# in a nod, and the two sides of a keyframe that two motions share are placed alike.
+# In the paper every window has the same number of keyframes. Motion far away then decides about keyframes here: a nod
+# takes them from the stillness around it and from the next second's smile. With a cost per keyframe, a keyframe is
+# placed where it saves more error than it costs, wherever the others are: none in stillness except those that `max_gap`
+# requires, many in a nod, and the two sides of a keyframe that two motions share are placed in the same way.
 #
 #     best[j] = cost + min(before[j], min_i best[i] + stretch[i, j])
 #
@@ -235,11 +235,11 @@ def mask_cost(cost: Segments, mask: Tensor) -> Tensor:
 # begins at frame b = j - r, r = min(ramp, j - i), then a straight line. With u = max(0, s - b) / r,
 #
 #     stretch[i, j] = sum over i < s <= j of |x_s - (1 - u) x_i - u x_j|^2
-#                   = (sum |x_s|^2 - 2 <x_j, sum u x_s> + ww |x_j|^2)        depends on j, but for where the sum begins
+#                   = (sum |x_s|^2 - 2 <x_j, sum u x_s> + ww |x_j|^2)        depends on j, except for the sum's start
 #                     + (j - i - r + vv) |x_i|^2 - 2 <x_i, sum x_s - sum u x_s - mixed x_j>
 #
-# with ww = sum u^2, mixed = sum u (1 - u), vv = sum (1 - u)^2 over the ramp. With prefix sums all but one product
-# <x_i, y[j]> depends on i or on j alone: a stretch costs one dot product.
+# with ww = sum u^2, mixed = sum u (1 - u), vv = sum (1 - u)^2 over the ramp. With prefix sums, all terms except one
+# product <x_i, y[j]> depend on i alone or on j alone: a stretch costs one dot product.
 
 
 @torch.no_grad()
@@ -250,7 +250,7 @@ def place_penalised(
 
     Args:
         motion: (B, T, C); scale the channels by how much each matters.
-        costs: (G,) of a keyframe, above 0, in squared units of the motion summed over a group's channels.
+        costs: (G,) cost of a keyframe, above 0, in squared units of the motion summed over a group's channels.
         member: (G, C), 1 where a channel belongs to a group.
         max_gap: at most this many frames from one keyframe to the next and to both ends; None for no bound.
         ramp: see above; None for straight lines all the way.
@@ -271,8 +271,8 @@ def stretches(x: Tensor, gap: int, ramp: int | None = None) -> tuple[Tensor, Ten
     """Return the errors of tracks x (N, T, c) in double precision, infinite where a gap is too large.
 
     Returns:
-        Held back from each frame to the start (N, T); to each frame from the keyframe d frames before it, at column d
-        (N, T, gap + 1); held from each frame to the end (N, T).
+        Errors (N, T) of holding each frame back to the start; errors (N, T, gap + 1) of the stretch to each frame from
+        the keyframe d frames before it, at column d; errors (N, T) of holding each frame to the end.
     """
     t = x.shape[1]
     x = x.double() - x.double().mean(1, keepdim=True)  # keeps the sums small
@@ -300,10 +300,10 @@ def stretches(x: Tensor, gap: int, ramp: int | None = None) -> tuple[Tensor, Ten
 
 
 def _cheapest(cost: float, before: Tensor, inside: Tensor, after: Tensor) -> list[list[int]]:
-    """Return the keyframes of every track, last to first, from the `cost` of one and `stretches`."""
+    """Return the keyframes of every track, last to first, from the `cost` of a keyframe and `stretches`."""
     best, band, ends = before.numpy() + cost, inside.numpy(), after.numpy()
     tracks, t = best.shape
-    # parent: the keyframe before in the cheapest mask that has one at j; -1: j is the first.
+    # parent: the keyframe before j in the cheapest mask with a keyframe at j; -1: j is the first.
     parent, every = np.full((tracks, t), -1), np.arange(tracks)
     for j in range(1, t):
         first = max(0, j - band.shape[2] + 1)

@@ -1,11 +1,11 @@
-"""Keyframe discovery (IV-B2): where the keyframes go. One function, `place(motion, k, ...) -> mask`, seven strategies.
+"""Keyframe discovery (IV-B2): the frames of keyframes. One function, `place(motion, k, ...) -> mask`, seven strategies.
 
     exact          the mask with the least error of linear interpolation, by dynamic programming
-    penalised      as many as pay for themselves: least error plus a cost per keyframe (`place_penalised`)
+    penalised      the mask with the least error plus a cost per keyframe, any number of them (`place_penalised`)
     static         evenly, centred
     static_paper   at every floor(N / k)-th frame, the paper's baseline, which leaves the window's end to extrapolation
     learned_paper  the paper's: one pass of the score network, Gumbel top-k by Algorithm 1
-    adaptive       the paper's that it gave up (IV-B3): a frame is one by its own score, (8) holds the number
+    adaptive       given up by the paper (IV-B3): a frame's own score makes it a keyframe, (8) holds their number
     learned        ours: conditional scores, computed again at each of the k steps, then swept over (`choose`, `sweep`)
 
 Shapes: B batch, T frames, C channels, G groups; a mask is (B, T, G) with exactly k[g] ones along T, except `penalised`
@@ -35,19 +35,19 @@ from sfms_robot.listeners.sfms.piecewise_linear import (
 )
 
 Strategy = Placement
-EPSILON = 1e-20  # of Algorithm 1, line 9: a chosen frame falls by 46, more than any two scores differ
-MOST_CURVES = 3  # principal curves of a group that the network sees
+EPSILON = 1e-20  # Algorithm 1, line 9: the score of a chosen frame falls by 46, more than any two scores differ
+MOST_CURVES = 3  # most principal curves of a group that the network sees
 STILL = 1e-3  # root mean square, standardised, below which motion counts as noise
-STATE_FEATURES = 11  # beside three per curve
+STATE_FEATURES = 11  # features in addition to three per curve
 TIME_SCALE_FRAMES = 48.0
 
 
 # --- Score networks ---------------------------------------------------------------------------------------------------
 #
-# How much each frame deserves to be a keyframe, per channel group. `ScoreNetwork` is the paper's: it looks at the
-# motion once, and the k highest scores are the keyframes. Scores of smooth motion are smooth, so the k highest are
+# A score is the preference for a frame as a keyframe, per channel group. `ScoreNetwork` is the paper's: it looks at
+# the motion once, and the k highest scores are the keyframes. Scores of smooth motion are smooth, so the k highest are
 # neighbours. `ConditionalScore` is ours, because of that: the same network, called again at every one of the k steps
-# with the frames already chosen and the number still to come. Next to a chosen frame no error is left to explain, so
+# with the frames already chosen and the number still to choose. Next to a chosen frame no error is left to explain, so
 # keyframes cannot cluster.
 
 
@@ -75,11 +75,12 @@ class ScoreNetwork(nn.Module):
 
 @dataclass(frozen=True)
 class Tracks:
-    """N windows of one group's channels, sample by sample, to choose keyframes for.
+    """N windows, each of one group's channels, to choose keyframes for; ordered sample by sample.
 
     Attributes:
-        curves: (N, T, P) the first principal curves of the group in this window; all of it when P channels suffice.
-        cost: errors of its stretches over all channels. Both in units of the window's own deviation.
+        curves: (N, T, P) the first principal curves of the group in this window; all of its motion if P channels
+            suffice.
+        cost: errors of its stretches over all channels. Both are in units of the window's own deviation.
     """
 
     curves: Tensor
@@ -91,7 +92,7 @@ class Tracks:
 
 @torch.no_grad()
 def tracks(motion: Tensor, member: Tensor, most: int) -> Tracks:
-    """Return the tracks of motion (B, T, C) with groups member (G, C), `most` principal curves each."""
+    """Return the tracks of motion (B, T, C) with groups `member` (G, C) and `most` principal curves each."""
     centred = motion - motion.mean(1, keepdim=True)
     curves, costs = [], []
     for row in member:
@@ -106,7 +107,7 @@ def tracks(motion: Tensor, member: Tensor, most: int) -> Tracks:
 def _principal(own: Tensor, most: int) -> Tensor:
     """Return the first principal curves (B, T, most) of centred channels (B, T, c), zeros where c is smaller."""
     channels = own.shape[-1]
-    if channels > 1:  # in double precision, which autocast leaves alone
+    if channels > 1:  # in double precision, which autocast does not change
         wide = own.double()
         axes = torch.linalg.eigh(wide.transpose(1, 2) @ wide).eigenvectors  # ascending
         own = (wide @ axes.flip(-1)[..., :most]).to(own.dtype)
@@ -131,7 +132,7 @@ class ConditionalScore(nn.Module):
 
 
 def _features(track: Tracks, chosen: Tensor, remaining: Tensor) -> Tensor:
-    """Return (N, T, 3 P + STATE_FEATURES): the motion, its interpolation between chosen frames, and the rest."""
+    """Return (N, T, 3 P + STATE_FEATURES): motion, interpolation between chosen frames, difference, state features."""
     curves = track.curves
     near = Neighbours.in_mask(chosen[..., None])
     drawn = near.interpolate((curves * chosen[..., None])[:, :, None])[:, :, 0]
@@ -142,9 +143,9 @@ def _features(track: Tracks, chosen: Tensor, remaining: Tensor) -> Tensor:
     now, then = stretch_errors(track.cost, chosen)
     total = left.sum(1, keepdim=True).clamp(min=STILL)
     gain = torch.where(now.isfinite(), now - then, then) / total  # error that this frame would remove
-    rest = torch.where(now.isfinite(), then / now.clamp(min=STILL), 0.0).clamp(max=2.0)  # and the share it would leave
+    rest = torch.where(now.isfinite(), then / now.clamp(min=STILL), 0.0).clamp(max=2.0)  # share that it would leave
     count = remaining.float()
-    told = (torch.zeros_like(count), count.log() / 2, 1 / count)  # the first is always 0: weights have a row for it
+    told = (torch.zeros_like(count), count.log() / 2, 1 / count)  # the first is always 0: the weights have a row for it
     frames = [chosen, rms.log().expand_as(chosen) / 3, *(one.float()[..., 0] for one in place)]
     frames += [one[:, None].expand_as(chosen) for one in told]
     frames += [torch.asinh(3 * gain), rest]
@@ -183,7 +184,7 @@ def place(
     costs: Sequence[float] = (),
     ramp: int | None = None,
 ) -> Tensor:
-    """Return a keyframe mask (B, T, G) of motion (B, T, C), deterministic, as encoding uses it.
+    """Return the deterministic keyframe mask (B, T, G) of motion (B, T, C) that encoding uses.
 
     Args:
         motion: standardised.
@@ -193,10 +194,10 @@ def place(
         score: network of the learned strategies.
         max_gap: bounds `exact` and `penalised`.
         sweeps: rounds of `sweep` that improve `learned`.
-        costs: of a keyframe per group, for `penalised`.
-        ramp: of the interpolation, for `penalised`.
+        costs: cost of a keyframe per group, for `penalised`.
+        ramp: ramp of the interpolation, for `penalised`.
 
-    Raises ValueError when a strategy has no score network of its kind, or k does not fit the frames.
+    Raises ValueError if a strategy has no score network of its kind, or k does not fit the frames.
     """
     if strategy == "penalised":
         return place_penalised(motion, costs, member, max_gap, ramp)
@@ -236,7 +237,7 @@ def place_exact(motion: Tensor, k: Sequence[int], member: Tensor, max_gap: int |
     """
     b, t, _ = motion.shape
     mask = motion.new_zeros(b, t, len(k))
-    for group, count in enumerate(k):  # one at a time: the tables of one group fit the processor's cache
+    for group, count in enumerate(k):  # one group at a time: its tables fit the processor's cache
         _check(count, t, max_gap)
         frames = best_frames(segments(motion[..., member[group] > 0.5], max_gap), count)
         mask[:, :, group] = mask[:, :, group].scatter(1, frames, 1.0)
@@ -263,10 +264,10 @@ def place_learned(
 ) -> tuple[Tensor, Tensor]:
     """Return (mask, relaxed mask), both (B, T, G), of scores (B, T, G): Gumbel top-k by Algorithm 1.
 
-    The mask is exactly k-hot going forward and carries the gradient of the relaxed one (line 18). Temperature 0 is
+    In the forward pass the mask is exactly k-hot; its gradient is that of the relaxed mask (line 18). Temperature 0 is
     evaluation: the k largest scores, no noise, no gradient. In Algorithm 1 the mask that is drawn does not depend on
-    the temperature: line 11 divides scores and noise alike. `tempered`: the first frame drawn is of
-    Categorical(exp(s / temperature)), as equation (6) reads, so the noise grows with the temperature.
+    the temperature: line 11 divides both scores and noise. `tempered`: the first frame is drawn from
+    Categorical(exp(s / temperature)), as in equation (6), so the noise grows with the temperature.
     """
     if temperature == 0.0:
         hard = torch.cat([_top_k(scores[..., g], c)[..., None] for g, c in enumerate(k)], dim=-1)
@@ -281,9 +282,9 @@ def place_learned(
 def place_adaptive(
     scores: Tensor, temperature: float = 0.0, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return (mask, relaxed mask) of scores (B, T, G), each frame separately (IV-B3): log-odds of being a keyframe.
+    """Return (mask, relaxed mask) of scores (B, T, G), which are each frame's log-odds of being a keyframe (IV-B3).
 
-    Temperature 0 is evaluation. A track of which no frame is likely has its likeliest one.
+    Frames are drawn separately. Temperature 0 is evaluation. A track without a likely frame has its likeliest one.
     """
     noisy, relaxed = scores, torch.sigmoid(scores)
     if temperature:
@@ -300,7 +301,7 @@ def _uniform_like(scores: Tensor, generator: torch.Generator | None) -> Tensor:
 
 
 def _relaxed_k_hot(noisy: Tensor, count: int, temperature: float) -> Tensor:
-    """Return the sum of k softmaxes, each without what the ones before have chosen (lines 7 to 13)."""
+    """Return the sum of k softmaxes, each without the frames that the earlier ones have chosen (lines 7 to 13)."""
     k_hot, one_hot = torch.zeros_like(noisy), torch.zeros_like(noisy)
     for _ in range(count):
         noisy = noisy + torch.log(torch.clamp(1.0 - one_hot, min=EPSILON))  # lines 9, 10
@@ -316,9 +317,9 @@ def _top_k(scores: Tensor, count: int) -> Tensor:
 
 # --- One keyframe after another ---------------------------------------------------------------------------------------
 #
-# Keyframes chosen one by one by conditional scores, then each chosen again once all are there. This is Algorithm 1 with
-# one change, ours: its lines 9 and 10 remove the frame just chosen from the same scores; here the scores are computed
-# again at each of the k steps.
+# Keyframes are chosen one by one by conditional scores, and once all are there, each is chosen again. This is Algorithm
+# 1 with one change, ours: its lines 9 and 10 remove the frame just chosen from the same scores; here the scores are
+# computed again at each of the k steps.
 
 
 @torch.no_grad()
@@ -348,9 +349,9 @@ def choose(score: ConditionalScore, track: Tracks, k: Tensor) -> Tensor:
 
 @torch.no_grad()
 def sweep(score: ConditionalScore, track: Tracks, mask: Tensor, together: int) -> Tensor:
-    """Take out `together` neighbouring keyframes of a mask (N, T) at a time, left to right, and choose them again.
+    """Remove `together` neighbouring keyframes of a mask (N, T) at a time, left to right, and choose them again.
 
-    A change is kept where it makes the error of linear interpolation smaller, so a sweep never makes a mask worse.
+    A change is kept if it makes the error of linear interpolation smaller, so a sweep never makes a mask worse.
     """
     cost = mask_cost(track.cost, mask)
     frame = torch.arange(mask.shape[1], device=mask.device)

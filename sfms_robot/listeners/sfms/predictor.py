@@ -1,12 +1,12 @@
 """Listening head prediction (IV-C): 40 frames of both people -> classes of the next 8 frames, per channel group.
 
 Class 0 is transition, class 1 + i the keyframe code i. The speaker has a gated dual encoder (`SpeakerEncoder`), the
-listener's own tokens an encoder of their own, and a decoder queries both from all future frames at once: the paper's
+listener's own tokens have a separate encoder, and a decoder queries both from all future frames at once: the paper's
 parallel prediction. Ours:
 
-    sequential   a small network at the end knows which keyframes precede each frame, so that frames drawn one after
-                 another agree; the transformers still run once per plan
-    events       a row of `signals.control` joins the tokens of each frame, past or future: the predictor knows which
+    sequential   a small network at the end receives the keyframes that precede each frame, so that frames drawn one
+                 after another agree; the transformers still run once per plan
+    events       a row of `signals.control` joins the tokens of each frame, past or future: it shows the predictor which
                  event a frame belongs to
     phase        the speaker's place in a phrase, which reaches back further than 40 frames
 
@@ -28,15 +28,15 @@ from sfms_robot.signals.control import COLUMNS
 from sfms_robot.signals.phase import FEATURES
 
 AGE_SCALE_FRAMES = 4.0
-KERNEL_ROWS = 5  # of the convolution over rows of sound
+KERNEL_ROWS = 5  # rows of sound in the kernel of the convolution
 
 
 def last_keyframes(tokens: Tensor) -> LastKeyframes[Tensor]:
     """Return `draw.last_keyframes` of tokens (B, T, G), computed on their device."""
-    known = F.pad(tokens.clamp(min=0), (0, 0, 1, 0))  # a frame before all others, for those that have none yet
+    known = F.pad(tokens.clamp(min=0), (0, 0, 1, 0))  # a frame before all others, for frames without a keyframe yet
     frame = torch.arange(known.shape[1], device=tokens.device)[:, None]
     last = torch.where(known > 0, frame, 0).cummax(1).values
-    before = torch.cat([last[:, :1], last[:, :-1]], dim=1).gather(1, last)  # as of the frame before
+    before = torch.cat([last[:, :1], last[:, :-1]], dim=1).gather(1, last)  # the keyframe before the last
     at = torch.stack([last, before], dim=-1)[:, 1:]
     return LastKeyframes(torch.stack([known.gather(1, one) for one in at.unbind(-1)], dim=-1), at - 1)
 
@@ -45,7 +45,7 @@ def last_keyframes(tokens: Tensor) -> LastKeyframes[Tensor]:
 #
 # The speaker's face and voice, fused by the gated dual encoder of equation (12). `listen` turns the sound of every
 # frame into one vector, looking back one frame and never ahead: it runs once per frame and serves all plans that look
-# back on that frame. The encoder then reads the last 40 of them together with the face.
+# back on that frame. The input of the encoder is the last 40 of these vectors together with the face.
 
 
 class GatedCross(nn.Module):
@@ -60,7 +60,7 @@ class GatedCross(nn.Module):
         self.ffn = NormFeedForward(width)
 
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return x (B, P, W) after looking at itself and at y (B, P, W)."""
+        """Return x (B, P, W) after attention to itself and to y (B, P, W)."""
         normed = self.norm(x)  # ours: pre-norm, as in all blocks here
         own = self.own(normed, normed)  # x~
         x = x + own + self.alpha * self.other(own, y)
@@ -76,7 +76,7 @@ class SpeakerEncoder(nn.Module):
         width, heads, layers = settings.predictor_width, settings.heads, settings.speaker_layers
         self.rows, bins = SHAPES[settings.audio]
         self.face_in = nn.Linear(len(settings.channels), width)
-        # Several rows a frame: convolution and max-pool align them; one: the direct path (IV-C1).
+        # Several rows per frame: convolution and max-pool align them; one row: the direct path (IV-C1).
         self.conv = nn.Conv1d(bins, width, KERNEL_ROWS) if self.rows > 1 else None
         self.direct: nn.Module = nn.Linear(bins, width) if self.rows == 1 else nn.Identity()
         self.phase_in = nn.Linear(FEATURES, width) if settings.phase else None
@@ -117,7 +117,7 @@ class Predictor(nn.Module):
 
     def __init__(self, settings: config.Sfms) -> None:
         super().__init__()
-        speaker = SpeakerEncoder(settings)  # first, as seeded weights were drawn so far
+        speaker = SpeakerEncoder(settings)  # created first, so that seeded weights stay the same
         width, heads, layers = settings.predictor_width, settings.heads, settings.predictor_layers
         grid = Grid([group.levels for group in settings.groups.values()])
         self.classes = [1 + group.codes for group in settings.groups.values()]
@@ -125,7 +125,7 @@ class Predictor(nn.Module):
         table = F.pad(grid.table.view(groups, most - 1, grid.dims), (0, 0, 1, 0))  # (G, V, D), 0 for none
         if settings.quantizer == "fsq":
             self.codes = nn.Buffer(table, persistent=False)
-        else:  # no grid says which codes are alike: that is learned
+        else:  # without a grid, the similarity of codes has to be learned
             self.codes = nn.Parameter(torch.randn_like(table) * 0.5)
         self.first = nn.Buffer(torch.arange(groups)[:, None] * most, persistent=False)  # row of `codes`, (G, 1)
         self.future = settings.future_frames
@@ -139,7 +139,7 @@ class Predictor(nn.Module):
         self.role = nn.Parameter(torch.randn(3, width) * 0.02)  # face, voice, own tokens
         self.phase_in = nn.Linear(FEATURES, width) if settings.phase else None
         self.decoder = nn.ModuleList(Block(width, heads, cross=True) for _ in range(layers))
-        # Names that these weights were first saved under.
+        # `trail_in` and `chain`: names under which these weights were first saved.
         self.trail_in = nn.Linear(described, width) if settings.sequential else None
         self.chain = NormFeedForward(width) if settings.sequential else None
         self.norm = nn.LayerNorm(width)
@@ -147,7 +147,7 @@ class Predictor(nn.Module):
         self.control_in = mlp(len(COLUMNS), width, width) if settings.events else None
 
     def forward(self, context: Context[Tensor], recent: LastKeyframes[Tensor] | None = None) -> Tensor:
-        """Return (B, H, W): every future frame without knowledge of the keyframes drawn before it.
+        """Return slots (B, H, W): every future frame without the keyframes drawn before it.
 
         `recent`: `last_keyframes` of the context's tokens, for a caller that has them.
         """
@@ -158,7 +158,7 @@ class Predictor(nn.Module):
         # The place in the phrase at the newest frame also goes to every future frame directly.
         newest = torch.where(c.heard[:, -1:], c.phase[:, -1], 0.0).expand(own.shape[0], -1)
         speaker = speaker.expand(own.shape[0], -1, -1)
-        # Ours: learned roles tell the decoder which modality a memory slot is of.
+        # Ours: learned roles mark the modality of each memory slot for the decoder.
         speaker = speaker + self.role[:2].repeat_interleave(c.heard.shape[1], dim=0)
         memory = torch.cat([speaker, own + self.role[2]], dim=1)  # (B, 2P + P + H, W)
         x = self.slots + own[:, -self.future :]  # (B, H, W): queries of the future frames
@@ -172,7 +172,7 @@ class Predictor(nn.Module):
         """Return (B, P + H, W) of tokens (B, P + H, G), their last keyframes and control rows (B, P + H, K)."""
         # A token is described by the last two keyframes of each group, not embedded alone: most frames are transitions.
         features = torch.cat([self.describe(recent, _frames(tokens)), (tokens > 0).float()], dim=-1)
-        # Frames that are not drawn yet are one learned vector; their control rows tell them apart.
+        # Frames that are not drawn yet are one learned vector; they differ by their control rows.
         x = torch.where((tokens >= 0).all(-1, keepdim=True), self.token_in(features), self.undecided)
         if self.control_in is not None:
             x = x + self.control_in(control)
@@ -184,7 +184,7 @@ class Predictor(nn.Module):
     def describe(self, recent: LastKeyframes[Tensor], frame: Tensor) -> Tensor:
         """Return (..., G * (2D + 2)): the codes of last keyframes (..., G, 2) and their ages at `frame`."""
         codes = F.embedding(recent.tokens + self.first, self.codes.flatten(0, 1))  # (..., G, 2, D)
-        # Near keyframes differ by single frames, old ones hardly: ages on a logarithmic axis.
+        # Single frames matter for the age of near keyframes, hardly for old ones: ages are on a logarithmic axis.
         ages = torch.log1p((frame - recent.at) / AGE_SCALE_FRAMES)
         return torch.cat([codes.flatten(-2), ages], dim=-1).flatten(-2)
 
@@ -202,7 +202,7 @@ class Predictor(nn.Module):
     def teacher_forced(self, context: Context[Tensor], target: Tensor) -> Tensor:
         """Return logits (B, H, G, V) of all future frames; a sequential predictor sees the true ones before each.
 
-        `target`: the true tokens (B, H, G). V are the most classes of a group, -inf for those that a group lacks.
+        `target`: the true tokens (B, H, G). V is the largest number of classes of a group; missing classes are -inf.
         """
         tokens = torch.cat([context.tokens[:, : -self.future], target], dim=1)
         # Ours, `sequential`: the last keyframes up to the frame before each future one, frames P - 1 to P + H - 2. It

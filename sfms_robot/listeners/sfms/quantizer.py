@@ -3,7 +3,7 @@
 Two kinds of codebook with one interface. Finite scalar quantization (Mentzer et al. 2023, arXiv:2309.15505): a code is
 a point on a small fixed grid; dimension d of group g has L[g, d] levels, spread evenly over -1..1, and the index of a
 code counts the levels in mixed radix, first dimension fastest. Vector quantization (van den Oord et al. 2017,
-arXiv:1711.00937): a code is the nearest of a list of learned vectors, each the running mean of what it stands for.
+arXiv:1711.00937): a code is the nearest of a list of learned vectors, each the running mean of its keyframes.
 
 B batch, T frames, C channels, G groups, D dimensions of a code, V codes of the largest group.
 """
@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 
-DECAY = 0.99  # of a vector's running mean, per step
+DECAY = 0.99  # decay of a vector's running mean, per step
 DEAD = 0.05  # a vector used less than this share of the average starts again at a keyframe
 HIDDEN = 48  # width of the network of one group
 
@@ -56,12 +56,12 @@ class Grid(nn.Module):
         return F.embedding(indices + self.first, self.table)
 
     def commitment(self, latent: Tensor, mask: Tensor) -> Tensor:
-        """Return 0 for the stop-gradient terms of equation (13): a grid cannot move, and rounding is never far."""
+        """Return 0 for the stop-gradient terms of equation (13): a grid cannot move, and rounding errors are small."""
         return latent.new_zeros(())
 
 
 class Codebook(nn.Module):
-    """V learned vectors per group. Only `learn` moves them, which training calls: encoding never changes them."""
+    """V learned vectors per group. Only `learn`, which training calls, moves them; encoding never changes them."""
 
     def __init__(self, sizes: Sequence[int], dims: int) -> None:
         super().__init__()
@@ -77,7 +77,7 @@ class Codebook(nn.Module):
 
     @torch.no_grad()
     def indices(self, codes: Tensor) -> Tensor:
-        """Return the indices (..., G) of the vectors nearest to (..., G, D), which need not be codes."""
+        """Return the indices (..., G) of the vectors nearest to `codes` (..., G, D), which may be any vectors."""
         # argmin |z - c|^2 of equation (3) = argmin |c|^2 - 2 <z, c>
         flat = codes.detach().float().flatten(0, -3).transpose(0, 1)  # (G, N, D)
         with torch.autocast(codes.device.type, enabled=False):  # nearest is a matter of small differences
@@ -153,7 +153,7 @@ class Quantizer(nn.Module):
     """
 
     def __init__(self, member: Tensor, settings: config.Sfms) -> None:
-        """Make one for the groups of the settings: `member` (G, C), 1 where a channel belongs to a group.
+        """Create a quantizer for the groups of the settings: `member` (G, C), 1 where a channel belongs to a group.
 
         A channel of no group is not drawn: it stays 0.
         """
@@ -163,13 +163,13 @@ class Quantizer(nn.Module):
         most = max(map(len, own))
         self.member = nn.Buffer(member, persistent=False)
         self.drawn = nn.Buffer(member.amax(0), persistent=False)
-        # Each group's channels in slots 0..: with a group per channel a full (G, C) matrix would be zeros but for 1/C.
+        # Each group's channels are in slots 0..: with a group per channel, only 1/C of a full (G, C) matrix is not 0.
         slots = torch.stack([F.pad(channels, (0, most - len(channels))) for channels in own])
         filled = torch.stack([(torch.arange(most) < len(channels)).float() for channels in own])
         self.slots, self.filled = nn.Buffer(slots, persistent=False), nn.Buffer(filled, persistent=False)  # (G, most)
         slot = ((member.cumsum(-1) * member).amax(0).long() - 1).clamp(min=0)
         self.owner = nn.Buffer(member.argmax(0), persistent=False)  # (C,) group of a channel
-        self.place = nn.Buffer(self.owner * most + slot, persistent=False)  # (C,) of a channel in all slots
+        self.place = nn.Buffer(self.owner * most + slot, persistent=False)  # (C,) place of a channel among all slots
         self.codebook: Grid | Codebook = (
             Codebook([group.codes for group in groups], settings.code_dims)
             if learned
@@ -180,8 +180,8 @@ class Quantizer(nn.Module):
         self.decoder = GroupMLP(len(groups), self.dims, most)
 
     def latent(self, motion: Tensor) -> Tensor:
-        """Return (B, T, G, D), not yet codes, of standardised motion (B, T, C)."""
-        # E of equation (3), of every frame: which of them are keyframes is decided apart.
+        """Return latents (B, T, G, D), not yet codes, of standardised motion (B, T, C)."""
+        # E of equation (3), of every frame: keyframes are chosen separately.
         out: Tensor = self.encoder(motion[..., self.slots] * self.filled)
         return torch.tanh(out) if self.squashed else out
 

@@ -1,12 +1,12 @@
-"""SFMS as it runs: one speaker frame in, and on every `hop`-th a plan of the next 8 frames out. numpy only.
+"""SFMS as a stream: one speaker frame in, and on every `hop`-th a plan of the next 8 frames out. numpy only.
 
-A new plan keeps the tokens that are left of the one before and draws only the `hop` frames at its far end. So a
-keyframe is decided (future - hop) to future frames ahead, 0.16 to 0.32 s with hop 4, and planning again cannot jitter.
-Only an event that is decided meanwhile calls tokens off: `draw` shows the window as a timeline. Motion behind the last
-keyframe drawn is an extrapolation, which the next plan may correct: it starts where the motion was, at the speed it
-had, and the difference fades over `seam_frames` (`join`).
+A new plan keeps the remaining tokens of the plan before and draws only its last `hop` frames. So a keyframe is decided
+(future - hop) to future frames ahead, 0.16 to 0.32 s with hop 4, and planning again cannot jitter. Only an event that
+is decided meanwhile revokes tokens: `draw` shows the window as a timeline. Motion after the last drawn keyframe is an
+extrapolation, which the next plan may correct: the new plan starts at the place and speed of the motion so far, and the
+difference fades over `seam_frames` (`join`).
 
-Between plans nothing is computed: frames are kept, and become features with the next plan, all of them at once.
+Between plans nothing is computed: frames are kept, and all become features at once with the next plan.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class SpeakerState:
     """The speaker's last P frames up to the newest plan, the newest last, and the frames since then.
 
     Attributes:
-        sounds, faces: of every frame since: its samples, and its motion (58,), NaN where no face is known.
+        sounds, faces: samples and motion (58,) of every frame since then; motion is NaN where no face is known.
         audio: state of unfinished features.
         rows: (R, bins) sound of the newest of the P frames, standardised.
         voice, heard, phase, face, face_known: (P, ...) of the P frames, as in `draw.Context`.
@@ -76,16 +76,16 @@ class SpeakerState:
 
 @dataclass(frozen=True, kw_only=True)
 class SfmsMemory:
-    """Memory of one stream; values only: a step makes a new one. All but `frames` is as of the newest plan.
+    """Memory of one stream; values only: a step makes a new one. `tokens`, `control`, `path` are of the newest plan.
 
     Attributes:
-        seed: of all its random numbers (`stream_rng`).
-        frames: how many it has taken.
-        speaker: the last P frames.
+        seed: seed of all its random numbers (`stream_rng`).
+        frames: number of frames so far.
+        speaker: the last P frames up to the newest plan, and the frames since then.
         tokens: (P + H, G) own tokens: past, drawn for the future, UNDECIDED.
-        control: (P + H, K) control rows that they were drawn under.
+        control: (P + H, K) control rows with which the tokens were drawn.
         path: (2 + H, C) standardised: the frame before, the frame itself, then the plan in force.
-        sway: of this stream (`HeadSway.start`).
+        sway: sway of this stream (`HeadSway.start`).
     """
 
     seed: int
@@ -101,7 +101,7 @@ class SfmsListener(RunsOnEngine):
     """SFMS as a stream; its engine runs `model.networks`."""
 
     def __init__(self, settings: config.Sfms, engine: Engine, folder: Path | None = None) -> None:
-        """Take what the settings name (a matrix, a model of sound) from the listener's `folder`.
+        """Create the listener; files that the settings name (a matrix, a model of sound) are in its `folder`.
 
         Raises ConfigError or ModelError.
         """
@@ -111,14 +111,14 @@ class SfmsListener(RunsOnEngine):
         self.frontend = AudioFrontend.of(settings, folder)
         self._scales = engine.tensors
         self.sway = HeadSway(settings, engine.tensors)
-        # Smoothing is of the head alone: its codes are coarse, and corners of its path make servos audible.
+        # Only the head is smoothed: its codes are coarse, and corners of its path make servos audible.
         self._smoothing = np.array([channel in HEAD for channel in settings.channels], np.float32)
         self._smoothing *= np.float32(settings.sampling.smoothing)
         self.hop, self.horizon = settings.hop_frames, settings.future_frames
         self.hops = range(1, self.horizon + 1) if settings.hop == "auto" else (self.hop,)
         if settings.events:
             self.control_frames, self.control_columns = (settings.past_frames, self.horizon), len(COLUMNS)
-        # Penalised keyframes hold until the next one: one that leaves the window has to be kept.
+        # Penalised keyframes hold until the next one: a keyframe that leaves the window has to be kept.
         self.holds = settings.placement == "penalised"
         # A stream begins with a still, neutral face: the paper trains with a neutral sequence before each clip (IV-C).
         mask = neutral_mask(settings.past_frames, len(settings.groups))
@@ -137,7 +137,7 @@ class SfmsListener(RunsOnEngine):
         self.sampler = Sampler(settings, engine, codes, self._courses(codes))
 
     def _courses(self, codes: Floats) -> list[EventCourse]:
-        """Return the courses that this listener keeps to; `codes` (V, C): standardised motion of every code."""
+        """Return the courses that this listener follows; `codes` (V, C): standardised motion of every code."""
         sampling = self.settings.sampling
         courses = []
         for how, group, shown in (
@@ -146,7 +146,7 @@ class SfmsListener(RunsOnEngine):
         ):
             if how is None or group is None:
                 continue
-            # The mean that each code of the group makes of the channels shown, on a face at rest.
+            # The mean of the channels shown for each code of the group, on a face at rest.
             own = [self.settings.channels.index(name) for name in self.settings.groups[group].channels]
             rows = self._still(self.settings.groups[group].codes)
             rows[:, own] = codes[: len(rows), own]
@@ -184,7 +184,7 @@ class SfmsListener(RunsOnEngine):
         memories: Sequence[SfmsMemory],
         controls: Sequence[Floats | None] | None = None,
     ) -> list[tuple[Plan | None, SfmsMemory]]:
-        """Move every stream one frame on: a Plan on every `hop`-th, None between. Those due are planned together.
+        """Advance every stream by one frame: a Plan on every `hop`-th, None between. Due plans are made together.
 
         Streams that began together with the same speaker share its state, so its features are computed once.
         """
@@ -200,7 +200,7 @@ class SfmsListener(RunsOnEngine):
                 before = memory.speaker
                 heard[same] = changed(before, sounds=(*before.sounds, sound), faces=(*before.faces, face))
             found.append((None, changed(memory, frames=memory.frames + 1, speaker=heard[same])))
-        due = [row for row, memory in enumerate(memories) if self.is_due(memory)]  # as of the frame before
+        due = [row for row, memory in enumerate(memories) if self.is_due(memory)]  # memories before this frame
         if due:
             told = self.told([None if controls is None else controls[row] for row in due])
             control = told.reshape(len(due), self.settings.window_frames, self.control_columns)
@@ -223,7 +223,7 @@ class SfmsListener(RunsOnEngine):
             rows = since == frames
             moved[rows], way[rows] = passed(tokens[rows], path[rows], frames, self.holds)
             under[rows] = later(drawn_under[rows], frames)
-        # 2. Events that were decided since then call tokens off (`draw.revoked`).
+        # 2. Events that were decided since then revoke tokens (`draw.revoked`).
         tokens, settled = revoked(moved, under, control, self.horizon)
         # 3. Sound and faces since then become features.
         speakers, seen = self._taken_in([memory.speaker for memory in memories])
@@ -243,9 +243,9 @@ class SfmsListener(RunsOnEngine):
         """Return motion in the model's space of standardised motion (..., N, C), with the slow motion of the head.
 
         Args:
-            shown: of frames `first`, `first` + 1, ...
-            sway: (..., 3, L, S) of each stream.
-            first: of all streams, or (...) of each.
+            shown: motion of frames `first`, `first` + 1, ...
+            sway: (..., 3, 1 + L, S) sway of each stream.
+            first: one number for all streams, or (...) for each.
         """
         return self.sway.added(shown * self._scales["motion_std"] + self._scales["motion_mean"], sway, first)
 
@@ -253,7 +253,7 @@ class SfmsListener(RunsOnEngine):
         """Return the future (..., H, C) of a path (..., 2 + H, C), standardised, with the head smoothed."""
         if not self.settings.sampling.smoothing:
             return path[..., 2:, :]
-        # x_t + s ((x_(t-1) + x_(t+1)) / 2 - x_t); behind the last frame the motion continues straight.
+        # x_t + s ((x_(t-1) + x_(t+1)) / 2 - x_t); after the last frame the motion continues straight.
         beyond = 2 * path[..., -1:, :] - path[..., -2:-1, :]
         before, own = path[..., 1:-1, :], path[..., 2:, :]
         after = np.concatenate([path[..., 3:, :], beyond], axis=-2)
@@ -265,9 +265,9 @@ class SfmsListener(RunsOnEngine):
         """Return the tokens (B, P + H, G) and path (B, 2 + H, C) of a new plan of B streams.
 
         Args:
-            seen, settled: as of `Sampler.draw`.
+            seen, settled: as for `Sampler.draw`.
             path: (B, 2 + H, C) the old plan, as played so far.
-            seeds: of each stream.
+            seeds: seed of each stream.
             newest: number of the newest frame of each stream, from 0 at its beginning.
         """
         # Equation (11): the tokens of the undecided frames; then equations (9) and (10): tokens become motion.
@@ -276,7 +276,7 @@ class SfmsListener(RunsOnEngine):
         return tokens, join(path[:, :2], decoded, self.settings.sampling.seam_frames)
 
     def voices(self, rows: Floats) -> Floats:
-        """Return (N, W) of standardised sound (N, 2R, bins) of N frames, each behind the one before it."""
+        """Return vectors (N, W) of standardised sound (N, 2R, bins) of N frames, each after the frame before it."""
         return self.engine.run("hear", rows)[0]
 
     def standardise_sound(self, rows: Floats) -> Floats:
@@ -288,9 +288,9 @@ class SfmsListener(RunsOnEngine):
         return np.repeat(self.standardise(self.space.neutral.astype(np.float32)[None]), frames, axis=0)
 
     def _taken_in(self, states: Sequence[SpeakerState]) -> tuple[Sequence[SpeakerState], dict[str, Any]]:
-        """Return states whose frames since the last plan are among their P, and the speaker's part of `Context`.
+        """Return states with the frames since the last plan among their P, and the speaker's part of `Context`.
 
-        Where all streams have the same speaker, that part is of one stream.
+        If all streams have the same speaker, that part has one stream.
         """
         if len(states) > 1 and all(state is states[0] for state in states):
             one, seen = self._taken_in(states[:1])
@@ -300,11 +300,11 @@ class SfmsListener(RunsOnEngine):
         rows, phase, audio = self.frontend.step_each(
             [state.sounds for state in states], [state.audio for state in states]
         )
-        # Features of all new frames of all streams, one stream behind the other.
+        # Features of all new frames of all streams, one stream after the other.
         heard = np.array([len(sound) > 0 for state in states for sound in state.sounds])
         # A frame without sound is 0, the mean of the data, not silence.
         rows = self.standardise_sound(rows.reshape(-1, *self.frontend.shape)) * heard[:, None, None].astype(np.float32)
-        # Each frame behind the one before it, the first of a stream behind the newest of its last plan: (N, 2R, bins).
+        # Each frame after the one before it, the first of a stream after the newest of its last plan: (N, 2R, bins).
         last = np.concatenate([rows[:1], rows[:-1]])
         last[ends - counts] = [state.rows for state in states]
         face, known = self._faces([face for state in states for face in state.faces])
@@ -328,7 +328,7 @@ class SfmsListener(RunsOnEngine):
         return after, found
 
     def _faces(self, motion: Sequence[Floats]) -> tuple[Floats, Bools]:
-        """Return standardised motion (N, C) and which faces are known, of motion (58,) of N frames, NaN where not."""
+        """Return standardised motion (N, C) and known faces (N,), of motion (58,) of N frames, NaN if not known."""
         rows = stacked(motion)
         known: Bools = np.asarray(np.isfinite(rows).all(axis=1))
         # A face that is not known is 0, the mean of the data; `face_known` marks it for the encoder.

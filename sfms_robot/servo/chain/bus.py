@@ -3,15 +3,15 @@
 Four promises:
 
 1. Torque comes on without a jump: goal := present, read back, then torque. A servo that stands outside the limits of
-   its joint is held where it stands; it may come in, and never go further out. One that stands outside its own stored
-   limits is moved inside by its own profile, slowly.
-2. One servo never costs the frame. The state of each is its own `Member`; `StatusPoll` reads them within a time budget.
-   Each joint has its own last position, age and fault.
-3. What was away (a servo, the wire, the supply) is found again, checked and switched on as at startup, beside the work
-   of the others; until then it gets no goals.
-4. Torque off is written before any request, to all servos at once, and then again until it is confirmed.
+   its joint is held in place; it may move towards the limits, but never further out. A servo that stands outside its
+   own stored limits is moved inside slowly, by its own profile.
+2. Trouble with one servo never costs a frame. Each servo has its own state (`Member`), and `StatusPoll` reads the
+   servos within a time budget. Each joint has its own last position, age and fault.
+3. A servo, wire or supply that was lost is found again, checked and switched on as at startup, while the other servos
+   keep working. Until then it gets no goals.
+4. Torque off is written to all servos at once, before any request, and again until it is confirmed.
 
-Follow a lost answer through three files: `poll` notices it, `member` decides what it means, and this file acts on it.
+A lost answer passes through three files: `poll` detects it, `member` decides what it means, and this file acts on it.
 """
 
 from __future__ import annotations
@@ -43,28 +43,28 @@ from sfms_robot.servo.registers import Field
 
 log = logging.getLogger(__name__)
 
-_CONFIRM_S: Final = 0.35  # that `stop` waits for servos to confirm, at most
-_ROUNDS: Final = 20  # of asking them; each takes a mute servo's patience
-_STOP_PATIENCE_S: Final = 0.02  # with an adapter that holds answers back
-_EXCHANGES: Final = 6  # of members on their way back, in one poll, all together
-_SENDING_S: Final = 0.005  # that torque-off waits for goals that are being written
+_CONFIRM_S: Final = 0.35  # longest wait of `stop` for confirmations
+_ROUNDS: Final = 20  # attempts of `stop` to confirm torque off, plus one per servo; each waits for silent servos
+_STOP_PATIENCE_S: Final = 0.02  # shortest wait for an answer in `stop`: an adapter may hold answers back
+_EXCHANGES: Final = 6  # exchanges in one poll, for all returning members together
+_SENDING_S: Final = 0.005  # longest wait of torque off for goals that are being written
 _WATCHDOG_TICK_S: Final = 0.02
-_STALL: Final = 0.8  # of the watchdog's time without a goal: it may have tripped
+_STALL: Final = 0.8  # part of the watchdog's time; after so long without a goal it may have tripped
 _NO_PLACES: Final = np.zeros(0, np.intp)
 
 
 class ChainBus(WireBus[RegisterLink]):
-    """A wire of servos of one family.
+    """Servo bus over one wire, with servos of one family.
 
     Args:
         name, servos, conversion, open_port, baud: see `WireBus`.
         read_deadline_s: time without a byte after which a servo counts as silent.
-        config: rate, watchdog and the like; `baud` and `read_deadline_s` take the place of those in it.
-        faults: which faults are acted upon.
+        config: rate, watchdog and other settings; `baud` and `read_deadline_s` replace the values in it.
+        faults: selects the faults that are acted upon.
 
     Attributes:
         maps: family and protocol of its firmware maps.
-        link, startup: classes of requests and of startup.
+        link, startup: the classes that make requests and start up a servo.
 
     Raises ConfigError for servos that cannot share a bus.
     """
@@ -89,8 +89,8 @@ class ChainBus(WireBus[RegisterLink]):
         self._ids = np.array([servo.id for servo in servos])
         self._telemetry = Telemetry(name, *self.maps, [servo.table for servo in servos], conversion)
         self.capabilities = {joint: self._telemetry.capabilities(index) for index, joint in enumerate(self.joints)}
-        self._faults: dict[str, None] = {}  # reported so far, for the statistics
-        self._warnings: dict[str, list[str]] = {}  # joints by what they store that weakens protection
+        self._faults: dict[str, None] = {}  # faults reported so far, for the statistics
+        self._warnings: dict[str, list[str]] = {}  # a stored value that weakens protection -> joints
         self._startups = [
             self.startup(servo, needs, self._warnings, lambda: [m.startup for m in self._members if m.comes_back])
             for servo, needs in zip(servos, needs_of(servos, conversion, faults), strict=True)
@@ -100,18 +100,18 @@ class ChainBus(WireBus[RegisterLink]):
         self._poll = StatusPoll(name, self._members, self._telemetry, config, self._counts, self.link.framing)
         self._settings = Settings(self._members, self._telemetry.torque, self._poll)
         self._enabled = False
-        self._places = _NO_PLACES  # members that get goals
-        self._rejoining: list[Member] = []  # members that wait for goals that begin where they stand
-        self._arrived = set[int]()  # indices of members that came to hold a position in this poll
+        self._places = _NO_PLACES  # indices of the members that get goals
+        self._rejoining: list[Member] = []  # members that wait for a goal near their position
+        self._arrived = set[int]()  # indices of members that returned in this poll, and hold a position
         self._stamp_s = 0.0
         self._peak_mA = 0.0
         self._released_ids = [servo.id for servo in servos if servo.safety.stop == "release"]
         self._release_packet = self._packet_off(self._released_ids)
-        self._released = False  # by `torque_off`: no goal is sent until the next `enable`
-        self._asked = deque[tuple[int, bool]]()  # released, or resumed (True); not yet passed to members
+        self._released = False  # by `torque_off` or `stop`: no goal is sent until `enable` or `resume`
+        self._asked = deque[tuple[int, bool]]()  # (index, True: resumed, False: released), not yet passed to members
         self._sending = RLock()
         goal = self._telemetry.goal
-        # Protocol 2.0 goals are encoded all at once; the others one by one, each checked against its sign rule.
+        # Protocol 2.0 goals are encoded as one array; other goals one by one, each checked against its sign rule.
         simple = self.maps[1] == 2 and goal.signed in ("no", "twos_complement")
         self._goal_type = np.dtype([("id", np.uint8), ("goal", raw_type(goal))]) if simple else None
         self._watchdog = math.ceil(config.watchdog_ms / 1e3 / _WATCHDOG_TICK_S)
@@ -119,7 +119,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._fed: Indices | None = None  # places whose watchdogs are armed
 
     def _open(self) -> RegisterLink:
-        """Open the port, and pass the link over it to all that make requests."""
+        """Open the port, and pass the link over it to the poll and the startups."""
         link = self._poll.link = self.link(self._open_port(), self._baud, self._read_deadline_s)
         for startup in self._startups:
             startup.link = link
@@ -129,10 +129,10 @@ class ChainBus(WireBus[RegisterLink]):
     # --- start --------------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open the port, identify and prepare every servo that answers; torque stays on or off.
+        """Open the port, identify and prepare every servo that answers; leave torque unchanged.
 
-        Blocks a few exchanges per servo, and for one that does not answer a few times 50 ms. Raises PortError;
-        BusError if no servo answers; ServoError for a servo that contradicts the head's file.
+        Blocks for a few exchanges per servo, and for a few times 50 ms per servo that does not answer. Raises
+        PortError; BusError if no servo answers; ServoError for a servo that contradicts the head's file.
         """
         link = self._open()
         try:
@@ -161,13 +161,13 @@ class ChainBus(WireBus[RegisterLink]):
     def enable(self, joints: Sequence[str]) -> Doubles:
         """Switch torque on for `joints` without a jump, one after the other; return the angles held, rad.
 
-        For a joint whose servo has not answered since `connect`: 0 rad, or the end of its range nearest to that, so
-        that easing goals can begin with a number. It gets no goals; when it appears it is started up, held where it
+        The angle of a joint whose servo does not answer is 0 rad, or the end of its range nearest to 0, so that easing
+        goals can begin with a number. The servo gets no goals. When it appears, it is started up and held where it
         stands, and its reading has `rejoined`.
 
-        Blocks a few exchanges per servo, and `stagger_ms`; for one that stands outside its own stored limits also the
-        seconds until its own profile has moved it inside. Raises ServoError if a servo refuses or falls silent
-        meanwhile, BusError if `torque_off` comes meanwhile; others may then have torque, so call `stop`.
+        Blocks for a few exchanges and `stagger_ms` per servo. For a servo that stands outside its own stored limits it
+        also blocks for the seconds until its own profile has moved it inside. Raises ServoError if a servo refuses or
+        stops answering, BusError if `torque_off` is called meanwhile. Other servos may then have torque: call `stop`.
         """
         link = self._connected()
         self._released = False
@@ -195,19 +195,19 @@ class ChainBus(WireBus[RegisterLink]):
         return np.array(held)
 
     def _forget(self, member: Member) -> None:
-        """Forget what was changed on a servo that is, or was, prepared again: its watchdog is off, too."""
+        """Forget the changes to a servo that is, or was, prepared again, which also switches its watchdog off."""
         self._settings.forget(member.id)
         self._fed = None
 
     def _wait_enabling(self, link: RegisterLink, joint: str, duration_s: float) -> None:
-        """Wait; raise BusError, with torque off, if `torque_off` has come."""
+        """Wait; if `torque_off` was called, write torque off again and raise BusError."""
         link.wait(duration_s)
         if self._released:
             self.torque_off("release")
             raise BusError(f"bus {self.name!r}: torque off was asked for while {joint} was being enabled")
 
     def _hold(self, index: int) -> float:
-        """Return the angle of a servo that holds where it stands; its range now reaches there."""
+        """Extend the range of a servo to the position that it holds; return its angle."""
         angle = float(self._conversion.to_rad(self._telemetry.ticks)[index])
         self._goals.hold(index, angle)
         return angle
@@ -215,9 +215,9 @@ class ChainBus(WireBus[RegisterLink]):
     # --- torque off, and on again -------------------------------------------------------------------------------
 
     def torque_off(self, policy: StopPolicy) -> None:
-        """Write torque off to the servos whose joints are to be released, in one packet; as `ports.Bus`.
+        """Write torque off to the servos whose joints are to be released, in one packet; see `ports.Bus`.
 
-        On a wire that goes both ways it may collide with bytes on their way to us; `stop` repeats it.
+        On a wire that carries both directions the packet may collide with an incoming answer; `stop` repeats it.
         """
         if policy == "hold":
             return
@@ -225,27 +225,27 @@ class ChainBus(WireBus[RegisterLink]):
         self._send_at_once(self._release_packet)
 
     def release(self, joints: Sequence[str]) -> None:
-        """Write torque off to the servos of `joints`, as `ports.Bus`; from any thread."""
+        """Write torque off to the servos of `joints`; see `ports.Bus`. May be called from any thread."""
         indices = frozenset(self.joints.index(joint) for joint in joints)
         if indices:
             self._asked.extend([(index, False) for index in indices])
             self._send_at_once(self._packet_off(self._servos[index].id for index in indices))
 
     def resume(self, joints: Sequence[str]) -> None:
-        """Bring joints back, as `ports.Bus`."""
-        if self._released:  # by `torque_off`, which perhaps no poll has noticed yet
+        """Request that joints are brought back; see `ports.Bus`."""
+        if self._released:  # by `torque_off`, which a poll may not have passed to the members yet
             self._asked.extend([(index, False) for index in range(len(self.joints))])
             self._released = False
         self._asked.extend([(self.joints.index(joint), True) for joint in joints])
 
     def _packet_off(self, ids: Iterable[int]) -> bytes:
-        """Return torque off for servos in one packet; empty for none."""
+        """Return the packet that switches torque off for servos; empty without servos."""
         torque = self._telemetry.torque
         values = dict.fromkeys(ids, torque.to_bytes(0))
         return self.link.sync_write_packet(torque.address, values) if values else b""
 
     def _send_at_once(self, packet: bytes) -> None:
-        alone = self._sending.acquire(timeout=_SENDING_S)  # a goal must not overtake it; a port that hangs may
+        alone = self._sending.acquire(timeout=_SENDING_S)  # no goal may follow; a port that hangs is not waited for
         try:
             link = self._link
             if link is not None and packet:
@@ -257,7 +257,7 @@ class ChainBus(WireBus[RegisterLink]):
                 self._sending.release()
 
     def _pass_on(self) -> None:
-        """Pass requests of `release` and `resume` to the members, in the thread that they belong to."""
+        """Pass requests of `release` and `resume` to the members, in the thread that may use members."""
         while self._asked:
             index, back = self._asked.popleft()
             member = self._members[index]
@@ -268,9 +268,9 @@ class ChainBus(WireBus[RegisterLink]):
         self._update_places()
 
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
-        """Write torque off in one packet, then watchdogs off in another; read both back and repeat them in time.
+        """Write torque off in one packet, then watchdogs off in another; read both back and repeat while time is left.
 
-        Waits for no servo before the torque is off.
+        Does not wait for any servo before torque off is written.
         """
         self._enabled = False
         self._released |= policy == "release"
@@ -279,7 +279,7 @@ class ChainBus(WireBus[RegisterLink]):
         self._update_places()
         link = self._link
         if link is None and self._lost:
-            link = self._open_again()  # perhaps it has just come back
+            link = self._open_again()  # the device may just have come back
         if link is None:
             return
         limp = self._released_ids if policy == "release" else []
@@ -305,9 +305,9 @@ class ChainBus(WireBus[RegisterLink]):
             self._attempt(lambda: link.sync_write(field.address, values))
 
     def _confirm_off(self, link: RegisterLink, field: Field, ids: Sequence[int]) -> frozenset[int]:
-        """Read a register of all back, and write 0 again to those that do not report 0; return those that do.
+        """Read a register of all servos back, and write 0 again until they report 0; return the ids that report 0.
 
-        The servo that is asked first in one round is asked last in the next: behind a dead servo the others are silent.
+        The servo that is read first in one round is read last in the next, since servos behind a dead one are silent.
         """
         rest, where, off = list(ids), (field.address, field.size), field.to_bytes(0)
         for _ in range(len(ids) + _ROUNDS):
@@ -325,7 +325,7 @@ class ChainBus(WireBus[RegisterLink]):
         return frozenset(ids).difference(rest)
 
     def close(self) -> None:
-        """Close the port; watchdogs that are still on are switched off, so that a held pose stays held."""
+        """Switch off the watchdogs that are still on, so that a held pose stays held, and close the port."""
         link, watchdog = self._link, self._startups[0].table.role(BUS_WATCHDOG)
         if link is not None and watchdog is not None:
             self._write_off(link, watchdog, self._settings.changed(BUS_WATCHDOG))
@@ -337,10 +337,10 @@ class ChainBus(WireBus[RegisterLink]):
     # --- every tick ---------------------------------------------------------------------------------------------
 
     def write(self, goals_rad: Doubles, now_s: float) -> None:
-        """Send goals of all joints in one packet; those of joints that are not enabled, or away, are left out.
+        """Send the goals of all joints in one packet, without those of joints that are not enabled or were lost.
 
         Raises ValueError, with nothing sent, before `enable`, for a goal that is not finite, or one out of range.
-        While the port is gone nothing is sent and nothing is raised.
+        While the port is lost, nothing is sent, and that is not an error.
         """
         self._check(self._enabled)
         if self._asked:
@@ -360,11 +360,11 @@ class ChainBus(WireBus[RegisterLink]):
                 self._send(link, places, ticks[places])
             except BusError as error:
                 self._lose(error, now_s)
-            except PacketError as error:  # this one cannot be built: the next may
+            except PacketError as error:  # the packet cannot be built; the next one perhaps can
                 self._count_error(error)
 
     def _send(self, link: RegisterLink, places: Indices, ticks: Ints) -> None:
-        """Send goals to the servos at `places`; `ticks` (n,). From the first goal on, every packet feeds a watchdog."""
+        """Send goals `ticks` (n,) to the servos at `places`. After the first goal, every packet feeds the watchdogs."""
         goal, now_s = self._telemetry.goal, link.port.now_s()
         ids = self._ids[places]
         if now_s - self._wrote_s > _STALL * self._watchdog * _WATCHDOG_TICK_S:
@@ -383,7 +383,7 @@ class ChainBus(WireBus[RegisterLink]):
             self._settings.arm(ids.tolist(), self._watchdog)
 
     def _accepted(self, goals_rad: Doubles) -> bool:
-        """Return whether a rejoining member gets goals from now on."""
+        """Offer the goals to the rejoining members; return whether one of them gets goals from now on."""
         if not self._rejoining:
             return False
         ticks = self._goals.ticks(goals_rad, _NO_PLACES)
@@ -394,7 +394,7 @@ class ChainBus(WireBus[RegisterLink]):
         return any(near)
 
     def _update_places(self) -> None:
-        """Find the members that get goals; the array stays the same object while it has the same content."""
+        """Find the members that get goals; the array is replaced only if its content changes."""
         self._rejoining = [member for member in self._members if member.state == "rejoining"]
         places = [member.index for member in self._members if member.gets_goals]
         if self._places.tolist() != places:
@@ -415,8 +415,8 @@ class ChainBus(WireBus[RegisterLink]):
     def poll(self, now_s: float) -> Readings:
         """Read the position of all servos that are not silent, more of some, and probe or start up others.
 
-        Blocks for `StatusPoll.budget_s` at most. Raises BusError if no servo has answered for so long that the bus has
-        failed.
+        Blocks for `StatusPoll.budget_s` at most, except for requests that `RegisterLink.grants` allows in addition.
+        Raises BusError if no servo has answered for so long that the bus has failed.
         """
         self._arrived.clear()
         return super().poll(now_s)
@@ -440,14 +440,14 @@ class ChainBus(WireBus[RegisterLink]):
         return answered
 
     def _readings(self, now_s: float) -> Readings:
-        """Return the readings; ages are by the port's clock, whatever the origin of `now_s`."""
+        """Return the readings. Ages are measured by the port's clock, since `now_s` may have another origin."""
         stamp_s = self._stamp_s if self._link is not None else self._now_s()
         for index in self._arrived:
             self._hold(index)
         return self._telemetry.readings(self.joints, [member.fault for member in self._members], self._arrived, stamp_s)
 
     def _bring_back(self, link: RegisterLink, now_s: float) -> None:
-        """Take a poll's share of the jobs of members on their way back; a silence ends it."""
+        """Run one poll's share of the jobs of returning members; an unanswered request ends it."""
         left, longest = _EXCHANGES, link.framing.reads(1, LONGEST_READ)
         for member in [member for member in self._members if member.state != "online"]:
             while left and member.waits and member.due(now_s):
@@ -472,6 +472,6 @@ class ChainBus(WireBus[RegisterLink]):
         self._update_places()
 
     def _returned(self, link: RegisterLink, now_s: float) -> None:
-        """Ask every member alone first."""
+        """Suspect all members, so that each is probed alone first."""
         for member in self._members:
             member.suspect(link.port.now_s(), pause_s=0.0)

@@ -1,9 +1,9 @@
-"""Registers over a wire, for every protocol: requests within a time budget, verified writes, servos with one id.
+"""Registers over a wire, for every protocol: requests in a time budget, verified writes, servos that share an id.
 
-A request to one servo returns None if there was no answer; the error byte of an answer is the protocol's. A request
-blocks until all answers are there, or no byte came for `silence_s` beyond the time that the bytes take on the wire.
-Inside `within` all requests share one allowance of silence, so that a poll takes one silence however many servos are
-dead. A request that `grants` refuses is allowed in the end, also on a wire that is too slow for its budget.
+A request to one servo returns None if there was no answer; the protocol defines the error byte of an answer. A
+request blocks until all answers are there, or no byte came for `silence_s` beyond the time that the bytes take on the
+wire. Inside `within` all requests share one allowance of silence, so a poll costs one silence, however many servos are
+dead. A request that `grants` refuses is allowed after a while, also on a wire that is too slow for its budget.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from sfms_robot.servo.registers import Field
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-Steps = Generator[float, None, T]  # work in steps: between two exchanges it yields the seconds it should wait
+Steps = Generator[float, None, T]  # work in steps; between two exchanges it yields the seconds to wait
 
 TRIES: Final = 3
 NO_PATIENCE: Final = 10  # read deadlines that noise on the wire may take before a request is given up
-LATE_S: Final = 0.25  # how long a purpose waits for room in a budget before it gets a request beside it
-AWAY_LATE_S: Final = 0.05  # the same for servos that are away
+LATE_S: Final = 0.25  # after this wait for room in the budget, a purpose gets one request in addition to it
+AWAY_LATE_S: Final = 0.05  # the same for servos that were lost
 _CHUNK: Final = 4096
-_SPENT_LATE_S: Final = 1.0  # the same if the time is there, but other servos' silence has used up the allowance
-_SLACK_S: Final = 0.001  # of a request that is granted, for a busy computer
-_ADAPTER_S: Final = 0.05  # the longest that an adapter may hold an answer back
+_SPENT_LATE_S: Final = 1.0  # the same if silent servos have used up the allowance
+_SLACK_S: Final = 0.001  # extra time of a request that is granted, for a busy computer
+_ADAPTER_S: Final = 0.05  # longest time that an adapter may hold an answer back
 _SAMPLES: Final = 3
 _MARGIN: Final = 1.25
-_MOST_READS: Final = 64  # after which a wire that never falls silent is given up
+_MOST_READS: Final = 64  # reads after which a wire that never falls silent is given up
 
 
 class Found(NamedTuple):
-    """The servo that answered a ping. None if the protocol's ping does not report it.
+    """The servo that answered a ping. Values that the protocol's ping does not report are None.
 
-    `firmware_minor`: of Feetech, whose firmware has two numbers.
+    `firmware_minor`: only of Feetech servos, whose firmware has two numbers.
     """
 
     model_number: int | None
@@ -62,19 +62,19 @@ Answers = dict[int, Answer]  # by id
 
 
 class RegisterLink(ABC):
-    """A wire of servos that have registers. Raises BusError if the port is gone, never for a silent servo.
+    """A wire of servos that have registers. Requests raise BusError if the port is gone, never for a silent servo.
 
     Args:
-        port: owned by the link from now on.
-        baud: bits per second, from which the time of bytes follows.
+        port: the port of the wire; the link owns it from now on.
+        baud: bits per second; it determines the time that bytes take.
         silence_s: time without a byte after which the servo counts as silent.
 
     Attributes:
-        framing: bytes of its packets.
+        framing: sizes of its packets, in bytes.
         has_fast_read: whether servos can answer in one packet.
-        tries: how often a startup asks before a servo counts as silent; 1 while the bus is running.
-        judged: whether the last request waited for the full silence. Inside `within` it may not have, and then a servo
-            that did not answer may still be there.
+        tries: attempts of a startup before a servo counts as silent; 1 while the bus is running.
+        judged: whether the last request waited for the full silence. Inside `within` a request may wait for
+            less, and then a servo that did not answer may still be there.
     """
 
     framing: ClassVar[Framing]
@@ -89,7 +89,7 @@ class RegisterLink(ABC):
         self._byte_s = BITS / baud
         self._end_s = math.inf
         self._left_s = math.inf
-        self._refused_s: dict[str, float] = {}  # since when a purpose has found no room
+        self._refused_s: dict[str, float] = {}  # purpose -> time at which it was first refused
 
     @abstractmethod
     def ping(self, servo: int) -> Found | None:
@@ -105,14 +105,14 @@ class RegisterLink(ABC):
 
     @abstractmethod
     def read_many(self, address: int, length: int, servos: Sequence[int], fast: bool = False) -> Answers:
-        """Read `length` bytes of several servos by one request; return the answers by id, of those that answered.
+        """Read `length` bytes of several servos by one request; return the received answers by id.
 
-        `fast`: all answer in one packet, which ends at the first silent servo (`has_fast_read`).
+        `fast`: all servos answer in one packet, which ends at the first silent servo (`has_fast_read`).
         """
 
     @abstractmethod
     def write(self, servo: int, address: int, data: bytes) -> Answer | None:
-        """Write to one servo; return the acknowledgement. Without one the servo may still have taken the data."""
+        """Write to one servo; return the acknowledgement. After None the servo may still have taken the data."""
 
     @staticmethod
     @abstractmethod
@@ -121,7 +121,7 @@ class RegisterLink(ABC):
 
     @abstractmethod
     def refusal(self, answer: Answer) -> str:
-        """Return why a request was refused, in words; empty if it was done, whatever fault the servo reports."""
+        """Return the reason of a refusal in words; empty if the request was done, even if the servo reports a fault."""
 
     @abstractmethod
     def reboot(self, servo: int) -> Answer | None:
@@ -129,20 +129,20 @@ class RegisterLink(ABC):
 
     @abstractmethod
     def factory_reset(self, servo: int, option: int) -> Answer | None:
-        """Reset everything (0xFF); Protocol 2.0 also all but the id (1), all but id and baud (2)."""
+        """Reset everything (`option` 0xFF). Protocol 2.0 can also keep the id (1), or id and baud (2)."""
 
     @classmethod
     def sync_write_packet(cls, address: int, values: Mapping[int, bytes]) -> bytes:
-        """Return the packet of `sync_write`, to be written from any thread."""
+        """Return the packet of `sync_write`, which may be written from any thread."""
         length = len(next(iter(values.values())))
         return cls.sync_packet(address, length, b"".join(bytes([servo]) + data for servo, data in values.items()))
 
     def sync_write(self, address: int, values: Mapping[int, bytes]) -> None:
-        """Write to several servos in one packet; all values have one length. Nothing answers."""
+        """Write to several servos in one packet; all values have one length. No servo answers."""
         self.send(self.sync_write_packet(address, values))
 
     def send(self, packet: bytes) -> None:
-        """Send a packet; drop what came before it."""
+        """Send a packet; drop the input received before it."""
         self.port.discard_input()
         self.port.write(packet)
         self._sent = packet
@@ -151,7 +151,7 @@ class RegisterLink(ABC):
 
     @contextmanager
     def patient(self, silence_s: float, tries: int = 1) -> Iterator[None]:
-        """Wait at least `silence_s` for answers inside the block, and let a startup ask `tries` times."""
+        """Wait at least `silence_s` for answers inside the block, and let a startup make `tries` attempts."""
         usual = self.silence_s, self.tries  # also restored after an error
         self.silence_s, self.tries = max(self.silence_s, silence_s), tries
         try:
@@ -161,12 +161,12 @@ class RegisterLink(ABC):
 
     @contextmanager
     def within(self, budget_s: float, silence_s: float) -> Iterator[None]:
-        """Set a time budget for the requests inside the block; whether one fits is for its caller to ask (`affords`).
+        """Set a time budget for the requests inside the block; their caller checks with `affords` whether they fit.
 
         Args:
-            budget_s: until then all requests are over.
-            silence_s: time spent waiting for answers that do not come, all requests together; once it is used up, a
-                request waits for no more than the time of its bytes.
+            budget_s: time after which all requests must be over.
+            silence_s: time that all requests together may wait for answers that do not come; once it is used up, a
+                request waits only for the time of its bytes.
         """
         self._end_s, self._left_s = self.port.now_s() + budget_s, silence_s
         try:
@@ -176,19 +176,19 @@ class RegisterLink(ABC):
             self.judged = True
 
     def affords(self, bytes_on_wire: int, alone: bool = False) -> bool:
-        """Return whether a request of so many bytes, answer included, is over in time even without an answer.
+        """Return whether a request of so many bytes, answer included, would end in time even without an answer.
 
-        `alone`: it is for one servo that may be silent, so it is of use only with a full silence left.
+        `alone`: it is for one servo that may be silent, so it is useful only if a full silence is left.
         """
         if alone and self._left_s < self.silence_s:
             return False
         return self.port.now_s() + bytes_on_wire * self._byte_s + min(self.silence_s, self._left_s) <= self._end_s
 
     def grants(self, purpose: str, bytes_on_wire: int, alone: bool = False, late_s: float = LATE_S) -> bool:
-        """Return `affords`; a purpose that was refused for `late_s` gets one request, whatever is left.
+        """Return `affords`, but allow one request, whatever is left, for a purpose that was refused for `late_s`.
 
         At 57600 baud, or with an adapter that holds every answer back for 16 ms, the first read uses up the budget of
-        every poll: without this no servo that was away would be found, and no fault would be read.
+        every poll. Without this exception no lost servo would be found, and no fault would be read.
         """
         if self.affords(bytes_on_wire, alone):
             self._refused_s.pop(purpose, None)
@@ -203,20 +203,20 @@ class RegisterLink(ABC):
         return True
 
     def wait(self, duration_s: float) -> None:
-        """Let time pass on the port's clock, in virtual time too."""
+        """Wait on the port's clock, which may be virtual."""
         if duration_s > 0.0:
             self.port.wait_until(self.port.now_s() + duration_s)
 
     def rest(self, duration_s: float) -> None:
-        """Leave the wire alone; in virtual time this takes no time. What comes meanwhile is dropped."""
+        """Leave the wire idle, and drop the bytes that come; in virtual time this takes no time."""
         end_s = self.port.now_s() + duration_s
         while self.port.read(_CHUNK, end_s):
             pass
 
     def adapt(self, servo: int, address: int, length: int) -> float:
-        """Measure how long the adapter holds answers back, and wait for longer than that from now on.
+        """Measure how long the adapter holds answers back, and set `silence_s` longer than that.
 
-        Returns `silence_s` in force from now on.
+        Returns the `silence_s` that is in force from now on.
         """
         held_s = 0.0
         with self.patient(_ADAPTER_S):
@@ -235,11 +235,11 @@ class RegisterLink(ABC):
         return self.silence_s
 
     def _incoming(self, first: int, rest: int = 0) -> Iterator[bytes]:
-        """Yield bytes as they come, until none came for the silence left; the consumer stops once it has all.
+        """Yield bytes as they come, until none comes for the remaining silence; the consumer stops when it has all.
 
         Args:
-            first: bytes of the request and of the first answer, whose time is waited for besides.
-            rest: bytes of the other answers. Noise on the wire may add `NO_PATIENCE` silences, but not in a budget.
+            first: number of bytes of the request and of the first answer; their time is added to the first wait.
+            rest: number of bytes of the other answers. Noise may add `NO_PATIENCE` silences, but not in a budget.
         """
         port, allowance_s = self.port, min(self.silence_s, self._left_s)
         self.judged = allowance_s >= self.silence_s
@@ -249,7 +249,7 @@ class RegisterLink(ABC):
         last_s = deadline_s + rest * self._byte_s + noise_s
         over = False
         while not over:
-            over = port.now_s() >= last_s  # this computer was busy meanwhile: what has come by now still counts
+            over = port.now_s() >= last_s  # bytes that came while this computer was busy still count
             if not (data := port.read(_CHUNK, min(deadline_s, last_s))):
                 break
             deadline_s = port.now_s() + allowance_s
@@ -261,7 +261,7 @@ class RegisterLink(ABC):
 
 
 class Silent(ServoError):
-    """A servo did not answer, as opposed to one that refuses."""
+    """Error about a servo that did not answer, as opposed to one that refuses."""
 
 
 def verified_write(
@@ -274,21 +274,20 @@ def verified_write(
     tries: int = TRIES,
     about: str | None = None,
 ) -> Steps[None]:
-    """Write one register, read it back, and repeat until it holds `value`: the one retry rule of startup and tools.
+    """Write one register, read it back, and repeat until it holds `value`. Startup and tools have no other retry rule.
 
-    Neither a missing acknowledgement proves anything (it may have been lost, the status return level may forbid it),
-    nor a received one (a locked EEPROM of Dynamixel 1.0 or Feetech acknowledges and takes nothing). Only the value read
-    back counts.
+    An acknowledgement proves nothing. A missing one may have been lost, or the status return level may forbid it. A
+    locked EEPROM of Dynamixel 1.0 or Feetech acknowledges a write and ignores it. Only the value read back counts.
 
     Args:
-        lock: the register that opens the EEPROM (0) and closes it (1), for a field behind one. It is closed again
-            whatever happens.
-        tries: writes before it is given up; a refusal, a silence and another value read back all count, since a
-            corrupted request can look like any of them.
+        lock: the register that opens the EEPROM (0) and closes it (1), for a field behind such a lock. Once it was
+            opened, it is closed again even if the write of the field fails.
+        tries: number of writes before giving up. A refusal, a silence and another value read back all count, since
+            a corrupted request can look like any of them.
         about: name of the servo in messages; `id 5` by default.
 
-    Yields between exchanges: 0.0, or after a silence the seconds that it took, so that a running bus ends its tick
-    there. One exchange blocks at most `link.silence_s` beyond the time its bytes take.
+    Yields between exchanges: 0.0, or `link.silence_s` after a silence, so that a running bus ends its tick there. One
+    exchange blocks at most `link.silence_s` beyond the time that its bytes take.
 
     Raises Silent if no read back was answered, ServoError for a value that does not fit, is refused or not taken,
     BusError if the port is gone.
@@ -300,7 +299,7 @@ def verified_write(
     yield from write(lock, 0)
     try:
         yield from write(field, value)
-    except BaseException:  # also if the caller closes this half way
+    except BaseException:  # also if the caller closes this generator early
         link.write(servo_id, lock.address, lock.to_bytes(1))
         raise
     yield from write(lock, 1)
@@ -335,7 +334,7 @@ def finish(steps: Steps[T], wait: Callable[[float], None] = lambda duration_s: N
     """Run work in steps to its end; return its result.
 
     Args:
-        wait: called between two exchanges with the seconds to wait. What it raises ends the work.
+        wait: called between two exchanges with the seconds to wait. An exception in it ends the work.
     """
     with closing(steps):
         while True:
@@ -351,11 +350,11 @@ def finish(steps: Steps[T], wait: Callable[[float], None] = lambda duration_s: N
 
 
 def looks_double(port: Port, protocol: int, servo: int, silence_s: float) -> bool:
-    """Ping one id; return whether two servos seem to have it. `protocol` is 2, or 1 (Feetech too).
+    """Ping one id; return whether two servos seem to have it. `protocol` is 2, or 1 (also for Feetech).
 
-    Two servos with one id answer together, so the ping brings two answers, or bytes that belong to none, which a link
-    drops. Two servos of one model that answer in the very same instant look like one: only a wire with a single servo
-    on it is certain. Blocks until there was no byte for `silence_s`.
+    Two servos with one id answer together, so the ping causes two answers, or bytes that belong to no answer, which a
+    link drops. Two servos of one model that answer at the very same time look like one servo: only a wire with a single
+    servo on it is certain. Blocks until no byte came for `silence_s`.
     """
     if protocol == 2:
         sent = dxl2.encode_instruction(servo, dxl2.PING)

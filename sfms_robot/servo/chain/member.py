@@ -2,18 +2,18 @@
 
     off        no torque is wanted: before `enable`, after `stop`
     online     has torque and gets goals
-    reduced    the same, with half the force: a fault or a load rule said so
-    faulty     keeps its torque where it stands and gets no goals: policy "hold"
-    limp       torque off is wanted; written in every poll until the servo reports that it is off
+    reduced    as online, with half the force, because of a fault or a load rule
+    faulty     holds where it stands, with torque, and gets no goals: policy "hold"
+    limp       torque off is wanted; it is written in every poll until the servo reports that torque is off
     silent     does not answer; gets no goals
     returning  is started up again: identity, settings, goal := present, torque
-    rebooting  the same after a reboot
+    rebooting  as returning, after a reboot
     rejoining  holds where it stands, and waits for goals that begin there
-    given up   failed too often: as limp, until it is enabled or called back
-    released   as limp, because it was asked for: not a fault
+    given up   as limp, after too many failures, until it is enabled or called back
+    released   as limp, on request: not a fault
 
-The diagram and a table of all arrows are in docs/safety.md. A goal is sent to members that are online or reduced and
-have been seen with torque, and to no others. So a servo that was away moves only from where it stands.
+The diagram and a table of all arrows are in docs/safety.md. Goals are sent only to members that are online or reduced
+and whose torque has been seen on. So a servo that was lost moves only from where it stands.
 Times are those of the port's clock, in seconds.
 """
 
@@ -32,24 +32,24 @@ from sfms_robot.servo.policy import BusServo, counts, load_rules
 
 log = logging.getLogger(__name__)
 
-TORQUE_LOST: Final = "torque lost"  # it restarted, or something switched it off
-TORQUE_ON: Final = "torque is not off"  # though that was written
+TORQUE_LOST: Final = "torque lost"  # the servo restarted, or its torque was switched off
+TORQUE_ON: Final = "torque is not off"  # although torque off was written
 NO_ANSWER: Final = "no answer"
 GIVEN_UP: Final = "left alone"
-MISSES: Final = 2  # single lost answers in a row before a servo counts as silent
-FIRST_PAUSE_S: Final = 0.05  # between two probes of a silent servo
+MISSES: Final = 2  # single lost answers in a row before a servo is suspect
+FIRST_PAUSE_S: Final = 0.05  # first pause between two probes of a silent servo
 LONGEST_PAUSE_S: Final = 1.0
-LOGGED_EVERY_S: Final = 10.0  # that a servo is silent: a loose contact comes and goes many times a second
-GATHER_S: Final = 0.25  # messages of one text that come within it are one line
-RETRY_S: Final = 0.2  # after a silence on the way back
-REFUSED_S: Final = 2.0  # after a refusal on the way back
-LIMP_S: Final = 3.0  # a joint that was pinched stays limp so long
-ATTEMPTS: Final = 3  # of coming back within `FORGET_S`, then it is given up
+LOGGED_EVERY_S: Final = 10.0  # between two messages about a silence: a loose contact may fail many times a second
+GATHER_S: Final = 0.25  # messages with the same text within this time share a line
+RETRY_S: Final = 0.2  # wait after a silence during a return
+REFUSED_S: Final = 2.0  # wait after a refusal during a return
+LIMP_S: Final = 3.0  # time that a joint stays limp, for example after a pinch
+ATTEMPTS: Final = 3  # most returns within `FORGET_S`; after them a servo is given up
 FORGET_S: Final = 60.0
-NEAR: Final = 1 / 500  # of a turn: a goal this close to where a joint stands continues from there
+NEAR: Final = 1 / 500  # part of a turn; a goal this close to the position of a joint continues from there
 
 
-MemberState = Literal[  # see the module
+MemberState = Literal[  # see the docstring of the module
     "off",
     "online",
     "reduced",
@@ -73,7 +73,7 @@ class Notices:
     """Log lines about the servos of one bus. Servos with the same message at about the same time share a line.
 
     Args:
-        servos: how many the bus has.
+        servos: number of servos of the bus.
     """
 
     def __init__(self, bus: str, servos: int) -> None:
@@ -82,11 +82,11 @@ class Notices:
         self._since_s: dict[tuple[int, str], float] = {}
 
     def add(self, servo: BusServo, text: str, level: int = logging.WARNING, times: int = 0) -> None:
-        """Keep a message for `log`. `times`: it was left out so often since the last one."""
+        """Keep a message for `log`. `times`: how often it was left out since the last message."""
         self._waiting.setdefault((level, text), {})[str(servo)] = times
 
     def log(self, now_s: float = math.inf) -> None:
-        """Log the messages that have waited for others for `GATHER_S`; all of them without a time."""
+        """Log the messages that have waited for similar ones for `GATHER_S`; without a time, log all."""
         for key in list(self._waiting):
             if now_s - self._since_s.setdefault(key, now_s if now_s < math.inf else 0.0) < GATHER_S:
                 continue
@@ -100,26 +100,26 @@ class Notices:
 
 
 class Member:
-    """One servo. Events come in by methods; its wishes are read from its attributes.
+    """State of one servo. Methods receive events; attributes show the requests that the servo needs.
 
     Args:
-        index: place in the bus.
-        startup: starts it up; has its joint, id, limits, safety and control table.
-        faults: which of its faults count.
+        index: position in bus order.
+        startup: starts the servo up; has its joint, id, limits, safety and control table.
+        faults: selects the faults that count.
         reported: faults of the bus, `joint: fault` in the order of appearance, for the report; each is logged once.
-        notices: of the bus.
+        notices: log lines of the bus.
 
     Attributes:
-        state: see the module.
-        listed: it is asked in every poll; otherwise it is probed alone, with growing pauses.
-        probe_s: when a servo that is not listed is asked next.
-        identified: it has been checked against the head's file.
-        torque_seen: what it last reported; None if that is not known.
-        job: its way back, in steps of one exchange; `job_due_s` is when the next is due.
-        recalled: it was called back and had not been away.
-        stands_ticks: position while it is rejoining, reported at some time since `stands_s`.
+        state: see the docstring of the module.
+        listed: the servo is read together with the others; otherwise it is probed alone, with growing pauses.
+        probe_s: time of the next probe of a servo that is not listed.
+        identified: the servo has been checked against the head's file.
+        torque_seen: whether the servo last reported torque on; None if that is not known.
+        job: the return of the servo, in steps of one exchange. `job_due_s`: time from which the next step may run.
+        recalled: the servo was called back, and had not been lost.
+        stands_ticks: position of a rejoining servo, reported at some time since `stands_s`.
         off_written: torque off has been sent since it was wanted.
-        mismatch: registers that do not hold what was written, in words.
+        mismatch: registers that do not hold the written value, in words.
     """
 
     def __init__(
@@ -144,12 +144,12 @@ class Member:
         self._reported = reported
         self._ignored = set[str]()  # faults that do not count, each logged once
         self._bits = 0
-        self._named: list[str] = []  # faults it reports, those that count
+        self._named: list[str] = []  # reported faults that count
         self._trouble: str | None = None  # any other fault
-        self._back_s = math.inf  # when a limp one may come back
+        self._back_s = math.inf  # when a limp servo may come back
         self._attempts_s: list[float] = []
         self._rules = load_rules(self.servo)
-        self._over_s: dict[str, float] = {}  # since when a rule is broken
+        self._over_s: dict[str, float] = {}  # rule -> since when it is broken
         self.lowest_mA = min((rule.current_mA for _, rule in self._rules), default=math.inf)
         self._forget_silence(True)
 
@@ -159,10 +159,10 @@ class Member:
         self._misses = 0
         self._pause_s = FIRST_PAUSE_S
         self._logged_s = -math.inf  # when its silence was last logged
-        self._unlogged = 0  # silences since
+        self._unlogged = 0  # silences since then
         self._logged_silent = False
 
-    # --- what it wants ------------------------------------------------------------------------------------------
+    # --- what the servo needs -----------------------------------------------------------------------------------
 
     @property
     def gets_goals(self) -> bool:
@@ -171,12 +171,12 @@ class Member:
 
     @property
     def to_release(self) -> bool:
-        """Return whether torque off has to be written: it is wanted and was not seen."""
+        """Return whether torque off has to be written: it is wanted and was not reported."""
         return self.state in _LIMP and self.torque_seen is not False
 
     @property
     def over_load(self) -> bool:
-        """Return whether a load rule is broken, not yet for long enough."""
+        """Return whether a load rule is broken, but not yet for long enough."""
         return bool(self._over_s)
 
     @property
@@ -197,14 +197,14 @@ class Member:
             self._blame(NO_ANSWER)
 
     def enabled(self) -> None:
-        """Note that `enable` switched torque on, and saw it. Faults it had before are not acted upon again."""
+        """Note that `enable` switched torque on and verified it. Earlier faults are not acted upon again."""
         self._drop_job()
         self.state, self._trouble, self.mismatch = "online", None, None
         self.identified = self.torque_seen = True
         self._attempts_s.clear()
 
     def awaited(self) -> None:
-        """Note that `enable` wants it, and it is absent: it is brought in when it appears."""
+        """Note that the servo is wanted but absent: it is brought in when it appears."""
         self._reset("silent")
         self._trouble = NO_ANSWER
 
@@ -214,13 +214,13 @@ class Member:
         self.state = "off"
 
     def released(self) -> None:
-        """Ask for torque off until `enable`; the poll writes it."""
+        """Request torque off until `enabled` or `called_back`; the poll writes it."""
         if self.state != "off":
             self._release(math.inf)
             self.state = "released"
 
     def called_back(self, now_s: float) -> None:
-        """Bring it back as if it had been away, unless it is driven or on its way; its faults count as known."""
+        """Bring it back as if it had been lost, unless it is driven, silent or returning; its faults count as known."""
         if self.state in _DRIVEN | _COMING | {"rejoining", "silent"}:
             return
         self._attempts_s.clear()
@@ -236,7 +236,7 @@ class Member:
         self._bits, self._named, self._trouble, self.mismatch = 0, [], None, None
         self._over_s.clear()
 
-    # --- whether it answers -------------------------------------------------------------------------------------
+    # --- silence and answers ------------------------------------------------------------------------------------
 
     def answered(self) -> None:
         """Note that it has answered a request."""
@@ -249,13 +249,13 @@ class Member:
             self.suspect(now_s)
 
     def suspect(self, now_s: float, pause_s: float = FIRST_PAUSE_S) -> None:
-        """Take it off the list, to be probed alone. It gets goals until a probe fails: the wire may be the cause."""
+        """Unlist it, so that it is probed alone. It gets goals until a probe fails: the wire may be the cause."""
         self.listed, self._pause_s, self.probe_s = False, FIRST_PAUSE_S, now_s + pause_s
         if pause_s:
             self._log_silence(now_s, again=True)
 
     def probe_failed(self, now_s: float) -> None:
-        """Note that it did not answer alone either."""
+        """Note that it did not answer a probe either."""
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
         self.probe_s = now_s + self._pause_s
         self._log_silence(now_s, again=False)
@@ -263,11 +263,11 @@ class Member:
             self.gone()
 
     def hurry(self, now_s: float) -> None:
-        """Probe it soon: another servo came back, and this one may, too."""
+        """Probe it soon, since another servo came back and this servo may be back, too."""
         self._pause_s, self.probe_s = FIRST_PAUSE_S, min(self.probe_s, now_s)
 
     def gone(self) -> None:
-        """Note that it does not answer, and not because of one lost packet; or that the port is gone."""
+        """Note that it does not answer, for another reason than one lost packet, or that the port is gone."""
         if self.state in _DRIVEN | _COMING | {"rejoining"}:
             self._drop_job()
             self.state = "silent"
@@ -287,7 +287,7 @@ class Member:
             self._trouble = None
 
     def _log_silence(self, now_s: float, again: bool) -> None:
-        """Log it once in ten seconds, with a count of those not logged. `again`: it is another silence."""
+        """Log a silence, once in ten seconds, with the count of silences not logged. `again`: a new silence began."""
         if self._logged_silent:
             return
         if now_s < self._logged_s + LOGGED_EVERY_S:
@@ -296,10 +296,10 @@ class Member:
         self._notices.add(self.servo, "silent", times=self._unlogged)
         self._logged_s, self._unlogged, self._logged_silent = now_s, 0, True
 
-    # --- what it reports ----------------------------------------------------------------------------------------
+    # --- what the servo reports ---------------------------------------------------------------------------------
 
     def take_bits(self, bits: int, measured: Mapping[str, float], now_s: float) -> None:
-        """Take fault bits; a fault that is new, or begins to count, is acted upon. `measured`: see `policy.counts`."""
+        """Process fault bits; act upon a fault that is new or begins to count. `measured`: see `policy.counts`."""
         if not bits and not self._bits:
             return
         self._bits = bits
@@ -311,7 +311,7 @@ class Member:
                 self._ignored.add(name)
                 log.info("%s reports %s, which this head's configuration allows", self.servo, name)
         new = set(names) - set(self._named)
-        # One that stays out keeps its reason, also a past one.
+        # A limp or faulty servo keeps the reason for that, even if the fault has passed.
         if names or self.state not in _LIMP | {"faulty"}:
             self._named = names
         if new:
@@ -333,7 +333,7 @@ class Member:
                 return
 
     def take_torque(self, on: bool, now_s: float) -> None:
-        """Compare torque enable, as the servo reports it, with what is wanted."""
+        """Compare the torque enable that the servo reports with the wanted state."""
         self.torque_seen = on
         if self.state in _LIMP:
             if on and self.off_written:
@@ -341,31 +341,31 @@ class Member:
             elif self._trouble == TORQUE_ON:
                 self._trouble = None
         elif self.state == "silent" and not on and self.identified:
-            self._report(TORQUE_LOST)  # it was away because it restarted
+            self._report(TORQUE_LOST)  # it was silent because it restarted
         elif self.state in POWERED and not on:
             if self._named:
-                self._release(math.inf)  # its own protection took the torque, and it reports why
+                self._release(math.inf)  # its own protection switched torque off, and it reports the reason
             else:
                 self._blame(TORQUE_LOST)
                 self._try_again(now_s, now_s)
 
     def take_registers(self, differing: Mapping[str, tuple[int, int]]) -> None:
-        """Take the registers that hold another value than was written, by name: (seen, wanted)."""
+        """Note the registers that hold another value than was written, by name: (seen, wanted)."""
         texts = [f"{name} reads {seen}, set to {wanted}" for name, (seen, wanted) in differing.items()]
         self.mismatch = ", ".join(texts) or None
         if self.mismatch:
             self._report(self.mismatch)
 
     def distrust(self, now_s: float) -> None:
-        """Start it up as if it had been away, after its watchdog has tripped: something may have happened unseen."""
+        """Start it up as if it had been lost, after its watchdog has tripped: something may have happened unnoticed."""
         if self.state in _DRIVEN | {"rejoining"}:
             self._trouble = "watchdog"
             self._return(now_s)
 
-    # --- the way back -------------------------------------------------------------------------------------------
+    # --- return -------------------------------------------------------------------------------------------------
 
     def due(self, now_s: float) -> bool:
-        """Return whether its job may take a step; a limp one whose time is over begins one."""
+        """Return whether its job may take a step; begin the job of a limp servo whose time is over."""
         if self.state == "limp" and now_s >= self._back_s and self.torque_seen is False:
             self._back_s = math.inf
             self._try_again(now_s, now_s)
@@ -373,16 +373,16 @@ class Member:
 
     @property
     def waits(self) -> bool:
-        """Return whether something is still to come: a job, or the end of being limp."""
+        """Return whether it has a job, or will come back after being limp for a time."""
         return self.job is not None or self._back_s < math.inf
 
     @property
     def comes_back(self) -> bool:
-        """Return whether it is away or on its way back, and was checked against the head's file in this run."""
+        """Return whether it is silent or returning, and was checked against the head's file in this run."""
         return self.identified and self.state in _COMING | {"silent"}
 
     def step(self, now_s: float) -> bool:
-        """Take one exchange of its job; return whether it now holds a position. Raises BusError if the port fails."""
+        """Make one exchange of its job; return whether it now holds a position. Raises BusError if the port fails."""
         if self.job is None:
             return False
         if self.stands_s is None:
@@ -403,7 +403,7 @@ class Member:
         return False
 
     def accepts(self, goal_ticks: int) -> bool:
-        """Return whether a goal for a rejoining joint continues from where that stands; it is online then."""
+        """Return whether a goal continues from the position of this rejoining servo; if so, set it online."""
         if abs(goal_ticks - self.stands_ticks) > NEAR * self.startup.table.ticks_per_revolution:
             return False
         self.state = "online"
@@ -425,7 +425,7 @@ class Member:
         if policy == "hold":
             self.state = "faulty"
         elif policy == "reduce":
-            # One that holds got no goals: the next may be far from where it stands.
+            # A servo that holds got no goals: the next goal may be far from its position.
             if self.state != "faulty":
                 self.state = "reduced"
         elif policy == "reboot_and_ease_in" and self.startup.can_reboot:
@@ -440,7 +440,7 @@ class Member:
             self.torque_seen = None
 
     def _try_again(self, due_s: float, now_s: float, reboot: bool = False) -> None:
-        """Bring it back, at most `ATTEMPTS` times: the cause is the servo, not the wire."""
+        """Bring it back, at most `ATTEMPTS` times, since the cause is the servo, not the wire."""
         recent = self._attempts_s = [t for t in self._attempts_s if now_s - t < FORGET_S]
         if len(recent) < ATTEMPTS:
             recent.append(now_s)

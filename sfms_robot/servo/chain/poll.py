@@ -1,9 +1,9 @@
-"""One poll of a wire: which servos answered, which did not, and what the answers say. For every family of the chain.
+"""One poll of a wire: its requests, the answers, and the servos that did not answer. For every family of the chain.
 
-On a chain each servo waits for the answer of the one before it, so where the answers to one request stop, exactly one
-servo is suspect, and those behind it are asked again in the same poll, without it. One lost answer in the middle is
-tolerated once. If no servo answers, none is suspect until it has happened a few times, and then all are: the supply may
-be gone. A suspect is probed alone, with growing pauses, until it answers.
+On a chain each servo waits for the answer of the servo before it. So where the answers to one request stop, exactly one
+servo is suspect, and the servos behind it are read again in the same poll, without it. A lost answer in the middle is
+tolerated once. If no servo answers, none is suspect until that has happened a few times; then all are suspect, since
+the supply may be gone. A suspect is probed alone, with growing pauses, until it answers.
 
 Servos 1 to 4, read together; "fast" is a fast sync read (one packet of all), "sync" a plain one. Requests of one poll:
 
@@ -20,14 +20,14 @@ Servos 1 to 4, read together; "fast" is a fast sync read (one packet of all), "s
                                                                    another servo and makes one request
     wire dead, third poll             fast 3 4 1 2                 all are suspect, and probed alone
 
-**Time.** A poll has a budget, and its requests share one allowance of silence (`RegisterLink.within`): the first read
-is always made, every other only if it would be over in time even without an answer (`affords`). So any number of silent
-servos costs a poll one read deadline, once; a servo for which a request had no time to wait is not suspect (`judged`).
+**Time.** A poll has a budget, and its requests share one allowance of silence (`RegisterLink.within`). The first read
+is always made, every other read only if it would end in time even without an answer (`affords`). So any number of
+silent servos costs a poll one read deadline. A servo is not suspect if its request had no time to wait (`judged`).
 
     budget = the larger of  0.8 / rate - goals,  first read + read deadline + a turn of the adapter
 
-If that never has room for something (a slow wire, an adapter that holds answers back), it gets one request a few times
-a second nevertheless (`grants`), and the poll is that much longer.
+A purpose for which the budget never has room (on a slow wire, or with an adapter that holds answers back) still gets
+one request a few times a second (`grants`), and the poll is longer by that request.
 """
 
 from __future__ import annotations
@@ -46,24 +46,24 @@ from sfms_robot.servo.codecs.dxl2 import ALERT
 
 log = logging.getLogger(__name__)
 
-USE: Final = 0.8  # of a tick; the rest is for probes, retries and a busy computer
-TURN_S: Final = 0.001  # of an adapter at every request: USB hands bytes over every millisecond
-QUIET_POLLS: Final = 3  # polls without any answer before servos are suspect rather than the wire
-_REQUESTS: Final = 3  # for the same data in one poll at most
+USE: Final = 0.8  # usable part of a tick; the rest is for probes, retries and a busy computer
+TURN_S: Final = 0.001  # delay of an adapter at every request: USB transfers bytes every millisecond
+QUIET_POLLS: Final = 3  # polls without any answer before all servos are suspect instead of the wire
+_REQUESTS: Final = 3  # requests for the same data in one poll, at most
 _SILENCES: Final = 2  # single reads in one poll that may stay unanswered
-_PROBES: Final = 4  # in one poll, as long as they are answered
+_PROBES: Final = 4  # most probes in one poll; an unanswered probe is the last
 _FAST_FAILURES: Final = 5
-_HEALTH_POLLS: Final = 5  # between two reads of torque and error status, if several servos are read at once
+_HEALTH_POLLS: Final = 5  # polls between two reads of torque and error status, if servos are read together
 _HEALTH_SHARE: Final = 8  # servos in one such read
-_ALERTS_READ: Final = 2  # per poll
-_IN_TURN_SHARE: Final = 0.6  # of a tick that reading servos one by one may take
+_ALERTS_READ: Final = 2  # servos with a new alert that are read in one poll
+_IN_TURN_SHARE: Final = 0.6  # part of a tick that reading servos one by one may take
 _GROUP_TRIAL_S: Final = 0.05
-_TURNAROUND_S: Final = 0.0005  # host and servo, between a request and its answer
+_TURNAROUND_S: Final = 0.0005  # delay of host and servo between a request and its answer
 
 
 @dataclass
 class PollOutcome:
-    """Answers to a read of all servos. `gaps`: ids where answers stopped; `missed`: ids that were passed over."""
+    """Answers to a read of all servos. `gaps`: ids at which answers stopped; `missed`: ids of other missing answers."""
 
     answers: Answers = field(default_factory=dict)
     gaps: list[int] = field(default_factory=list)
@@ -72,20 +72,20 @@ class PollOutcome:
 
 
 class StatusPoll:
-    """Reads the members of one bus and passes them the answers.
+    """Reader of the members of one bus, which passes them their answers.
 
     Args:
         bus: its name, for messages.
         members: in bus order.
-        telemetry: takes positions and the like.
-        config: of the bus.
-        counts: of the bus: reads, errors and retries are incremented in place.
-        framing: bytes of the packets on this wire.
+        telemetry: receives positions and other values.
+        config: configuration of the bus.
+        counts: counters of the bus; reads, errors and retries are incremented in place.
+        framing: sizes of the packets on this wire, in bytes.
 
     Attributes:
-        link: to the wire; set by the bus when it opens the port.
+        link: link over the wire; set by the bus when it opens the port.
         read_deadline_s: time without a byte after which a servo counts as silent on this wire.
-        budget_s: time that a poll may take, waiting for answers included; what is granted besides is not.
+        budget_s: time that a poll may take, with waits for answers, but without requests that are granted in addition.
         quiet_polls: polls in a row in which no servo answered.
     """
 
@@ -115,11 +115,11 @@ class StatusPoll:
         self.restart(grouped=False)
 
     def restart(self, grouped: bool, fast: bool = False, proven: bool = True) -> None:
-        """Begin with another connection.
+        """Forget the past, and begin with a new connection.
 
         Args:
             grouped: several servos can be read by one request; otherwise they are read one by one, in rotation.
-            fast: also in one packet of all, which is given up if it fails too often.
+            fast: servos can answer in one packet together, which is given up if it fails too often.
             proven: the fast read is known to work here.
         """
         self._grouped, self._fast = grouped, fast
@@ -136,7 +136,7 @@ class StatusPoll:
     def find_reads(self, present: list[int], group: bool) -> None:
         """Find out how the servos that answered, `present`, can be read together, and begin with this connection.
 
-        `group`: one request for several is worth a try. All servos with fast reads answer it.
+        `group`: try one request for several servos. Where the link has a fast read, all servos answer such a request.
         """
         if self.link.has_fast_read:
             wanted = self._config.fast_read
@@ -163,7 +163,7 @@ class StatusPoll:
             return self._framing.reads(servos, length, way) * byte_s + TURN_S
 
         self._blocks = count
-        if telemetry.error is not None and read_s(count, block) > spare_s:  # others are always asked for the block
+        if telemetry.error is not None and read_s(count, block) > spare_s:  # other families always read the block
             left_s = spare_s - read_s(count, position)
             self._blocks = max((few for few in range(2, count + 1) if read_s(few, block) <= left_s), default=1)
         single_s = self._framing.reads(1, block, "one by one") * byte_s + _TURNAROUND_S
@@ -176,7 +176,7 @@ class StatusPoll:
         return "together" if self._grouped else "one by one"
 
     def _bytes(self, servos: int, length: int) -> int:
-        """Return the bytes of reading `length` bytes of each, by one request if the wire has one."""
+        """Return the bytes on the wire to read `length` bytes of each servo, by one request if the wire supports it."""
         return self._framing.reads(servos, length, self._way)
 
     def measure(self, now_s: float) -> None:
@@ -203,7 +203,7 @@ class StatusPoll:
         return self._probe(now_s) or bool(answers)
 
     def blocks(self, now_s: float) -> None:
-        """Read the full block of some servos in what is left of the poll, if it has no time for all."""
+        """Read the full block of some servos in the rest of the poll, if it has no time for the blocks of all."""
         where = self._telemetry.block
         count = self.fitting("blocks", where[1], self._blocks) if self._answered else 0
         if count:
@@ -217,9 +217,9 @@ class StatusPoll:
         return [member.id for member in self._members if member.listed]
 
     def fitting(self, purpose: str, length: int, most: int) -> int:
-        """Return how many servos can be asked for `length` bytes in what is left of the poll, `most` at most.
+        """Return how many servos, `most` at most, can be asked for `length` bytes in the rest of the poll.
 
-        One if the purpose has waited for too long.
+        This is one servo if the purpose has waited for too long.
         """
         if most <= 0:
             return 0
@@ -230,7 +230,7 @@ class StatusPoll:
         return most if self.link.grants(purpose, self._bytes(most, length)) else 0
 
     def read_some(self, purpose: str, where: Block, ids: Sequence[int]) -> Mapping[int, Answer]:
-        """Return answers of as many of `ids` as there is time for, by one request if the wire has one."""
+        """Read as many of `ids` as there is time for, by one request if the wire supports it; return the answers."""
         if self._grouped:
             ids = ids[: self.fitting(purpose, where[1], len(ids))]
             if not ids:
@@ -247,13 +247,13 @@ class StatusPoll:
         return answers
 
     def _read_all(self, where: Block, ids: Sequence[int]) -> PollOutcome:
-        """Read all by one request, and those behind a silent one by a second: see the table of the module."""
+        """Read all by one request, and those behind a silent servo by another; see the table of the module."""
         out = PollOutcome()
-        # Behind a dead servo in front all are silent: after a quiet poll another servo is asked first.
+        # Behind a dead first servo all are silent, so after a quiet poll another servo is asked first.
         start = self.quiet_polls * (len(ids) // QUIET_POLLS or 1) % max(1, len(ids))
         rest = [*ids[start:], *ids[:start]]
         for attempt in range(_REQUESTS):
-            # A wire that was quiet in the last poll too is asked once: most likely all are gone.
+            # If the wire was also quiet in the last poll, make only one request: most likely all servos are gone.
             if not rest or (attempt > 0 and not out.answers and self.quiet_polls > 0):
                 break
             if attempt > 0 and not self.link.affords(self._bytes(len(rest), where[1])):
@@ -267,7 +267,7 @@ class StatusPoll:
             if fast and not got:
                 if self._fast_proven:  # the first servo is the likely cause: one silence in a poll is enough
                     out.missed, rest = rest[:1], rest[1:]
-                else:  # either the first servo or the fast read is the cause: now the others come first
+                else:  # either the first servo or the fast read is the cause: read the others first
                     rest = [*rest[1:], rest[0]]
                 continue
             if self._fast and attempt == 1 and len(out.answers) == len(got):
@@ -281,11 +281,11 @@ class StatusPoll:
                 out.gaps += rest[last + 1 : last + 2]
             rest = rest[last + 2 :]
         if not out.answers:
-            out.missed = []  # on a quiet wire none was passed over
+            out.missed = []  # on a quiet wire no answer counts as missed
         return out
 
     def _count_against_fast(self, all_there: bool) -> None:
-        """Count a silence to a fast read after which all answered a plain one."""
+        """Count an unanswered fast read; reset the count unless all then answered a plain read."""
         self._fast_failures = self._fast_failures + 1 if all_there else 0
         if self._fast_failures >= _FAST_FAILURES:
             self._fast = False
@@ -293,7 +293,7 @@ class StatusPoll:
             log.warning("bus %r: fast sync read is not answered; plain sync read from now on", self._bus)
 
     def _read_in_turn(self, ids: Sequence[int]) -> PollOutcome:
-        """Read servos one by one, as many per poll as its share of a tick allows, from where the last poll ended."""
+        """Read servos one by one, as many per poll as its share of a tick allows; begin where the last poll ended."""
         out, where = PollOutcome(), self._telemetry.block
         count = len(self._members)
         order = sorted(ids, key=lambda servo: (self._by_id[servo].index - self._turn) % count)
@@ -309,11 +309,11 @@ class StatusPoll:
                 if len(out.gaps) >= _SILENCES:
                     break
         out.judged = bool(out.gaps)
-        if not out.answers:  # the servo or the wire: one that does not answer in the next round either is suspect
+        if not out.answers:  # servo or wire is the cause; a servo that misses the next round, too, is suspect
             out.missed, out.gaps = out.gaps, []
         return out
 
-    # --- which servos are there ---------------------------------------------------------------------------------
+    # --- missing servos -----------------------------------------------------------------------------------------
 
     def _suspect(self, outcome: PollOutcome, now_s: float) -> None:
         """Notify the members that missed an answer or are suspect after a read of all."""
@@ -330,7 +330,7 @@ class StatusPoll:
             self._by_id[servo].suspect(now_s)
 
     def _probe(self, now_s: float) -> bool:
-        """Ask members that are not listed and have waited long enough, one by one, until one does not answer."""
+        """Probe members that are not listed and have waited long enough, one by one, until one does not answer."""
         answered = False
         where = self._telemetry.position if self._grouped else self._telemetry.block
         request = self._bytes(1, self._telemetry.block[1])
@@ -359,7 +359,7 @@ class StatusPoll:
             member.back(now_s)
         return answered
 
-    # --- what they report ---------------------------------------------------------------------------------------
+    # --- reports ------------------------------------------------------------------------------------------------
 
     def _take(self, where: Block, answers: Mapping[int, Answer], now_s: float) -> list[int]:
         """Pass on values and status of answers; return ids whose alert bit was newly set."""
@@ -371,13 +371,13 @@ class StatusPoll:
         for servo, (error, content) in answers.items():
             member = members[servo]
             if len(content) != length or (alert and error & ~ALERT):
-                self._counts["errors"] += 1  # it refuses
+                self._counts["errors"] += 1  # the servo refuses
             else:
                 good.append(member.index)
                 data.append(content)
             if error or servo in flagged:
                 status = error & self._error_bits[member.index]
-                if alert and status:  # the alert only says that there is a fault, which is asked for once
+                if alert and status:  # the alert only reports that there is a fault, which is read once
                     if servo not in flagged:
                         fresh.append(servo)
                 elif status or servo in flagged:
@@ -398,7 +398,7 @@ class StatusPoll:
                 member.take_current(currents[index], now_s)
 
     def _look(self, ids: Sequence[int], now_s: float) -> None:
-        """Read of a few servos what is not in the block: torque, error status, a current with another address."""
+        """Read what is outside the block of a few servos: torque, error status, a current at another address."""
         if not ids:
             return
         self._polls += 1
@@ -422,7 +422,7 @@ class StatusPoll:
             self.judge_loads([index], now_s)
 
     def _look_at_alerts(self, fresh: Sequence[int], now_s: float) -> None:
-        """Ask servos whose alert bit was newly set for their faults; those left out are asked in the next poll."""
+        """Read the faults of servos whose alert bit was newly set; servos left out are read in the next poll."""
         asked = fresh[:_ALERTS_READ]
         answers = self.read_some("alerts", self._telemetry.health, asked) if asked else {}
         self._flagged -= set(fresh) - answers.keys()
@@ -440,12 +440,12 @@ class StatusPoll:
 
 
 class Rotation:
-    """A rotation that gives turns to servos, `count` at a time."""
+    """Rotation of turns among servos, `count` at a time."""
 
     _next = 0
 
     def take(self, servos: Sequence[int], count: int) -> list[int]:
-        """Return the next `count` of `servos`, in their order; one that is missing from the list loses no turn."""
+        """Return the next `count` of `servos`, in their order. No turn is spent on a servo that is missing."""
         if count >= len(servos):
             return list(servos)
         start = self._next % len(servos)

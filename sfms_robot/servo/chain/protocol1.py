@@ -1,16 +1,15 @@
-"""Servos that speak the FF FF frame, Dynamixel 1.0 and Feetech: requests, answers, startup, and buses.
+"""Servos with the FF FF frame, Dynamixel 1.0 and Feetech: requests, answers, startup, and buses.
 
-The vendor's SDK builds requests to Dynamixel servos (`sdk_packets`); our codec builds sync writes, and all of Feetech,
-which has other instructions.
+The vendor's SDK builds requests to Dynamixel servos (`sdk_packets`). Our codec builds sync writes, and all requests to
+Feetech servos, which have other instructions.
 
-The frame does not say what an answer answers, so a late answer could pass for the next one. Three rules prevent that:
-an answer counts only from an id that was asked and with the number of bytes that was asked for; what came before a
-request is dropped; and no request is made whose answer would be as long as one that the servo still owes. In that case
-the servo is first asked for data of another length (a fence). It answers in order, so once it has answered that,
-nothing older can come.
+An answer does not identify its request, so a late answer could be mistaken for the next one. Three rules prevent that.
+An answer counts only if its id and its number of bytes were requested. Bytes that came before a request are dropped. No
+request is made whose answer would be as long as one that the servo still owes; in that case the servo is first asked
+for data of another length (a fence). A servo answers in order, so after the answer to a fence no older answer can come.
 
-These servos switch their torque on when a goal is written, so the first goal written is always the present position.
-Withholding goals keeps a limp one limp. They have no reboot, and report their faults in every answer.
+These servos switch their torque on when a goal is written, so the first goal written is always the present position,
+and a limp servo stays limp because its goals are withheld. They have no reboot, and report faults in every answer.
 """
 
 from __future__ import annotations
@@ -31,9 +30,9 @@ from sfms_robot.servo.policy import torque_limit
 from sfms_robot.servo.port import Port
 from sfms_robot.servo.registers import Field, Values
 
-_OWED_S: Final = 1.0  # an answer that has not come by then never will
-_FENCES: Final = 2  # of a group at most: answers share one wire, so those behind cannot overtake
-_STAGGER_S: Final = 0.003  # lerobot @7427f31, motors/feetech/feetech.py: what a broadcast ping may take per id
+_OWED_S: Final = 1.0  # an answer that has not come by then is not expected any more
+_FENCES: Final = 2  # fences of a group, at most: answers share one wire, so later ones cannot overtake
+_STAGGER_S: Final = 0.003  # time of a broadcast ping per id (lerobot @7427f31, motors/feetech/feetech.py)
 
 
 class Protocol1Link(RegisterLink):
@@ -41,12 +40,12 @@ class Protocol1Link(RegisterLink):
 
     family: ClassVar[str]
     who_length: ClassVar[int]  # bytes from address 0 on that hold model number and firmware
-    refusal_bits = 0  # of the error byte, about the request
+    refusal_bits = 0  # bits of the error byte about the request
     _packet: Callable[[int, int, bytes], bytes]  # returns a request: servo, instruction, parameters
 
     def __init__(self, port: Port, baud: int, silence_s: float) -> None:
         super().__init__(port, baud, silence_s)
-        self._owed: dict[int, dict[int, float]] = {}  # servo -> length of an answer -> when it was asked for
+        self._owed: dict[int, dict[int, float]] = {}  # servo -> length of an owed answer -> time of its request
         self._echoed = False
 
     @abstractmethod
@@ -55,7 +54,7 @@ class Protocol1Link(RegisterLink):
 
     @abstractmethod
     def _identity(self, data: bytes) -> Found:
-        """Return what the first `who_length` bytes of the table say."""
+        """Return the identity in the first `who_length` bytes of the table."""
 
     # --- one servo ----------------------------------------------------------------------------------------------
 
@@ -63,7 +62,7 @@ class Protocol1Link(RegisterLink):
         """Ping a servo and read its identity, which this protocol's ping does not report."""
         if self._ask(servo, protocol1.PING, b"", 0) is not None:
             return self._who(servo)
-        # With only the voltage bit set, an answer to a ping has the bytes of the ping: it looks like an echo.
+        # An answer to a ping with only the voltage bit set has the same bytes as the ping, so it looks like an echo.
         if self._echoed and (who := self._who(servo)).model_number is not None:
             return who
         return None
@@ -78,14 +77,14 @@ class Protocol1Link(RegisterLink):
         return protocol1.refusal_text(answer.error & self.refusal_bits)
 
     def reboot(self, servo: int) -> Answer | None:
-        """Raise PacketError: these protocols have no such instruction."""
+        """Raise PacketError: these protocols have no reboot instruction."""
         raise PacketError(
             f"{self.port.name}: servo {servo} speaks {self.family} and has no reboot instruction: "
             "switch its supply off and on"
         )
 
     def factory_reset(self, servo: int, option: int) -> Answer | None:
-        """Reset everything, id and baud included. Raises PacketError if `option` asks to keep something."""
+        """Reset everything, id and baud included. Raises PacketError for an `option` that keeps something."""
         if option != 0xFF:
             raise PacketError(f"{self.port.name}: a {self.family} servo resets everything (255), not option {option}")
         return self._ask(servo, protocol1.FACTORY_RESET, b"", 0)
@@ -112,15 +111,15 @@ class Protocol1Link(RegisterLink):
             answered = self._fence(servo)
             judged |= self.judged
             if answered:
-                for each in servos:  # nothing older than that answer can come, from any of them
+                for each in servos:  # no older answer can come, from any of them
                     self._owed.pop(each, None)
                 break
             closed.append(servo)
         else:
-            closed = late  # what they owe may still come
+            closed = late  # the answers that they owe may still come
         asked = [servo for servo in servos if servo not in closed]
         if not asked:
-            self.judged = judged  # by one of them: the last may have had no time left
+            self.judged = judged  # true for any of the fences: the last one may have had no time left
             return {}
         self.send(self._packet(BROADCAST, *self._group_request(address, length, asked)))
         return self._answers(asked, length)
@@ -137,14 +136,14 @@ class Protocol1Link(RegisterLink):
         return length in owed
 
     def _fence(self, servo: int) -> bool:
-        """Ask for data of a length that no owed answer has; return whether the servo answered."""
+        """Request data of a length that no owed answer has; return whether the servo answered."""
         size = next(size for size in range(MAX_FRAME) if size not in self._owed[servo])
         request = (protocol1.READ, bytes([0, size])) if size else (protocol1.PING, b"")
         self.send(self._packet(servo, *request))
         return servo in self._answers([servo], size)
 
     def _answers(self, servos: Sequence[int], length: int) -> Answers:
-        """Return answers of `servos` with `length` bytes of data, or with a refusal and none.
+        """Return answers of `servos` with `length` bytes of data, or with a refusal and no data.
 
         Waits until all are there, or no byte came for the silence beyond the time that the bytes take.
         """
@@ -154,7 +153,7 @@ class Protocol1Link(RegisterLink):
         for data in self._incoming(len(echo) + size, (len(servos) - 1) * size):
             buffer += data
             if len(buffer) < len(echo) and echo.startswith(buffer):
-                continue  # perhaps an adapter that receives its own bytes
+                continue  # this may be an adapter that receives its own bytes
             if echo and buffer.startswith(echo):
                 self._echoed = True
                 del buffer[: len(echo)]
@@ -193,15 +192,15 @@ class Dynamixel1Link(Protocol1Link):
         return Found(int.from_bytes(data[:2], "little"), data[2])
 
     def broadcast_ping(self) -> dict[int, Found]:
-        """Ping all 254 ids, one silence each: this protocol has no such request."""
+        """Ping all 254 ids, at one silence each: this protocol has no broadcast ping."""
         return {servo: found for servo in range(protocol1.MAX_ID + 1) if (found := self.ping(servo)) is not None}
 
 
 class FeetechLink(Protocol1Link):
     """A wire of Feetech servos. STS and SMS answer a sync read, SCS not reliably.
 
-    Their error byte is about the servo alone: no bit says that a request was refused. Bytes 0 to 4 of the table are
-    firmware (major, minor), byte order (0: low byte first) and model number.
+    Their error byte describes only the servo; no bit reports a refused request. Bytes 0 to 4 of the table are firmware
+    (major, minor), byte order (0: low byte first) and model number.
     """
 
     family = "feetech"
@@ -238,7 +237,7 @@ class Protocol1Startup(Startup):
         return who
 
     def _acknowledge(self) -> None:
-        """Raise its status level, unconfirmed: while that is low, it answers pings and nothing else."""
+        """Raise the status level, without confirmation: at a low level, a servo answers only pings."""
         lock, level = self.table.role("lock"), self._field("status_level")
         raised = level, level.high
         for field, value in [raised] if lock is None else [(lock, 0), raised, (lock, 1)]:
@@ -257,12 +256,12 @@ class Protocol1Startup(Startup):
 
     def _defaults(self, now: Values) -> Values:
         defaults, limit = {self._name("return_delay"): 0}, self.table.role("torque_limit")
-        if limit is not None and "max_torque" in now:  # the EEPROM's; an earlier run may have left less in RAM
+        if limit is not None and "max_torque" in now:  # from the EEPROM; an earlier run may have left less in RAM
             defaults[limit.name] = now["max_torque"]
         return defaults
 
     def _set(self, now: Values, name: str, target: int) -> Steps[bool]:
-        """Write a register, but no torque limit of 0: that is a shutdown, and stays until torque is switched on."""
+        """Write a register, but keep a torque limit of 0: that is a shutdown, in force until torque is switched on."""
         if name == self._name("torque_limit") and not now[name]:
             return False
         return (yield from super()._set(now, name, target))
@@ -280,7 +279,7 @@ class Protocol1Startup(Startup):
             yield from self._write(table[name], value)
 
     def _write(self, field: Field, value: int) -> Steps[None]:
-        """Write and verify; an error adds the fault that the servo reports."""
+        """Write and verify a register; add the fault that the servo reports to an error."""
         try:
             yield from super()._write(field, value)
         except Silent:
@@ -295,8 +294,8 @@ class Protocol1Startup(Startup):
 class Dynamixel1Bus(ChainBus):
     """A bus of Dynamixel servos of Protocol 1.0: AX, and MX with their old firmware.
 
-    MX servos answer a bulk read, one request for all. AX servos do not, nor does a bus with one of them: there servos
-    are read one by one, in rotation. The bus finds out when it connects.
+    MX servos answer a bulk read, one request for all. AX servos do not, so on a bus with an AX servo all are read one
+    by one, in rotation. The bus finds out when it connects.
     """
 
     maps = "dynamixel", 1
@@ -307,8 +306,8 @@ class Dynamixel1Bus(ChainBus):
 class FeetechBus(ChainBus):
     """A bus of Feetech servos, all of one byte order.
 
-    STS and SMS (low byte first) answer a sync read, one request for all. SCS (high byte first) do not reliably, so they
-    are read one by one, in rotation.
+    STS and SMS (low byte first) answer a sync read, one request for all. SCS (high byte first) do not
+    answer it reliably, so they are read one by one, in rotation.
     """
 
     maps = "feetech", 1

@@ -1,9 +1,9 @@
 """Dynamixel servos of Protocol 2.0: requests and answers over a port, their startup, and their bus.
 
-The vendor's SDK builds reads (`sdk_packets`), each once: they are sent again unchanged. Our own codec builds writes,
-because the SDK (4.1.0) stuffs a copy of a packet and then sends the original.
+The vendor's SDK builds reads (`sdk_packets`), each only once; they are sent again unchanged. Our own codec builds
+writes, because the SDK (4.1.0) stuffs a copy of a packet and then sends the original.
 
-Answers are found in the byte stream by id and length, so that a late or foreign reply is never taken for another one.
+Answers are found in the byte stream by id and length, so that a late or foreign answer is never mistaken for another.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from sfms_robot.servo.stored_settings import contradictions
 
 log = logging.getLogger(__name__)
 
-_PING_S: Final = 0.0035  # what each of 253 ids may take to answer a broadcast ping, as the SDK reckons
-_LENGTHS: Final = 4  # of a read of several servos, one byte apart
+_PING_S: Final = 0.0035  # time of each of 253 ids to answer a broadcast ping, as in the SDK
+_LENGTHS: Final = 4  # different lengths of reads of several servos, one byte apart
 _HEADER: Final = b"\xff\xff\xfd"
 _LONGEST_FAST: Final = dxl2.MAX_PACKET + 4096  # bytes after which a fast answer is given up
 
 _TORQUE_ON_BY_GOAL: Final = 0x08  # drive mode bit 3
-_REBOOT_S: Final = 0.5  # until a rebooted servo is sure to answer
+_REBOOT_S: Final = 0.5  # time until a rebooted servo is sure to answer
 
 
 class Dynamixel2Link(RegisterLink):
@@ -39,7 +39,7 @@ class Dynamixel2Link(RegisterLink):
 
     framing = FRAMINGS["dynamixel2"]
     has_fast_read = True
-    _extra = 0  # bytes that reads of several servos ask for besides what is wanted
+    _extra = 0  # bytes that reads of several servos request in addition to the wanted bytes
 
     # --- one servo ----------------------------------------------------------------------------------------------
 
@@ -61,7 +61,7 @@ class Dynamixel2Link(RegisterLink):
         return self._instruct(servo, dxl2.FACTORY_RESET, bytes([option]))
 
     def clear_turns(self, servo: int) -> Answer | None:
-        """Set the present position back into one revolution (CLEAR 01, with its key). Only at rest."""
+        """Bring the present position back into one revolution (CLEAR 01, with its key). Only at rest."""
         return self._instruct(servo, dxl2.CLEAR, b"\x01\x44\x58\x4c\x22")
 
     def read(self, servo: int, address: int, length: int) -> Answer | None:
@@ -72,7 +72,7 @@ class Dynamixel2Link(RegisterLink):
         return self._instruct(servo, dxl2.WRITE, address.to_bytes(2, "little") + data)
 
     def refusal(self, answer: Answer) -> str:
-        """Return the error number in bits 0..6 in words; bit 7 only says that register 70 is worth a look."""
+        """Return the error number in bits 0..6 in words; bit 7 only reports that register 70 holds a fault."""
         if not (number := answer.error & ~dxl2.ALERT):
             return ""
         text = dxl2.ERRORS.get(number, f"error {number}")
@@ -93,15 +93,15 @@ class Dynamixel2Link(RegisterLink):
         if self._extra:
             answers = {servo: Answer(error, data[:length]) for servo, (error, data) in answers.items()}
         if len(answers) < len(servos):
-            # A status packet does not say what it answers: after a silence the next request asks for another length,
-            # so that a late answer cannot be taken for its answer.
+            # A status packet does not identify its request. After a silence the next request has another length, so
+            # that a late answer cannot be mistaken for its answer.
             self._extra = (self._extra + 1) % _LENGTHS
         return answers
 
     # --- inside -------------------------------------------------------------------------------------------------
 
     def _answers(self, servos: Sequence[int], length: int) -> Answers:
-        """Return status packets of `servos` with `length` bytes of data, or with an error and none.
+        """Return status packets of `servos` with `length` bytes of data, or with an error and no data.
 
         Waits until all are there, or no byte came for the silence beyond the time that the bytes take.
         """
@@ -125,7 +125,7 @@ class Dynamixel2Link(RegisterLink):
         buffer, start = bytearray(), -1
         for data in self._incoming(len(self._sent) + size):
             buffer += data
-            if start < 0:  # noise may come before the header; FE is the id of the one packet of all
+            if start < 0:  # noise may come before the header; FE is the id of the shared packet
                 start = buffer.find(_HEADER + b"\x00\xfe")
             if len(buffer) >= max(start, 0) + size or len(buffer) > _LONGEST_FAST:
                 break
@@ -146,10 +146,10 @@ class Dynamixel2Startup(Startup):
     """Startup of servos that report their firmware, which decides the addresses of their registers."""
 
     can_reboot = True  # instruction 08
-    unlimited = ("profile_acceleration", "profile_velocity", "moving_speed")  # the last of the XL-320
+    unlimited = ("profile_acceleration", "profile_velocity", "moving_speed")  # the last one is for the XL-320
 
     def recognise(self, found: Found) -> None:
-        """Raise ServoError for another model; take the table of the firmware that answers."""
+        """Raise ServoError for another model; use the table of the firmware that the servo reports."""
         super().recognise(found)
         low, high = self.table.firmware
         if found.firmware is not None and not low <= found.firmware <= high:
@@ -160,7 +160,7 @@ class Dynamixel2Startup(Startup):
 
     def _read_state(self) -> Steps[dict[str, int]]:
         if (level := self.table.role("status_level")) is not None:
-            # Status return level 2, unconfirmed: at level 0 a servo answers pings and nothing else.
+            # Status return level 2, not confirmed: at level 0 a servo answers only pings.
             self.link.sync_write(level.address, {self.servo.id: level.to_bytes(2)})
         return (yield from self._clear_turns((yield from self._snapshot())))
 
@@ -185,9 +185,9 @@ class Dynamixel2Startup(Startup):
         return defaults
 
     def _clear_turns(self, now: dict[str, int]) -> Steps[dict[str, int]]:
-        """Let a servo that was turned by hand past its one turn forget whole turns (CLEAR), at rest without torque.
+        """Clear the whole turns (CLEAR) of a servo that was turned by hand past one turn, at rest without torque.
 
-        The shaft stays; only its reading comes back into the turn of position mode.
+        The shaft does not move; only the position that it reports comes back into the turn of position mode.
         """
         present = self._field("present_position")
         found = contradictions(now, self.table, self._needs)
@@ -208,8 +208,8 @@ class Dynamixel2Bus(ChainBus):
     """A bus of Dynamixel servos of Protocol 2.0, in position mode.
 
     They are read by one fast sync read (all answer in one packet) while that works, else by a plain sync read. A
-    watchdog that stops the servo is armed after the first goal, fed by the goals themselves, and switched off after the
-    torque at the end.
+    watchdog that stops the servo is armed after the first goal, fed by all later goals, and switched off at the end,
+    after the torque.
     """
 
     maps = "dynamixel", 2

@@ -1,8 +1,8 @@
 """Packets as the vendor's SDK (dynamixel_sdk) builds them. The only file of the servo layer that imports it.
 
-The SDK builds a packet while it sends it, so it is given a port that keeps the bytes. It is not used for answers: it
-would wait at least 34 ms for each, spin meanwhile and stop at the first failure. All functions raise PacketError for
-packets that the SDK refuses to send.
+The SDK builds a packet while it sends it, so it gets a port that stores the bytes. It is not used for answers: it
+would wait at least 34 ms for each answer in a busy loop, and stop at the first failure. All functions raise PacketError
+for packets that the SDK refuses to send.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from sfms_robot.errors import PacketError
 
 _SDK1: Final = Protocol1PacketHandler()
 _SDK2: Final = Protocol2PacketHandler()
-_KEPT: Final = 512  # requests, which are sent again unchanged
+_KEPT: Final = 512  # cached requests, which are sent again unchanged
 
 
 class _Draft:
-    """A port, as the SDK's packet builders use one, that keeps what they send."""
+    """Port for the SDK's packet builders that stores the packet they send."""
 
     is_using = False
     packet = b""
@@ -38,19 +38,19 @@ class _Draft:
 
 
 def instruction1(servo: int, code: int, params: bytes) -> bytes:
-    """Return a request of Protocol 1.0 to one servo, or to all."""
+    """Return the packet of a request of Protocol 1.0 to one servo, or to all."""
     return _built(_SDK1.txPacket, [0, 0, servo, len(params) + 2, code, *params, 0])
 
 
 @lru_cache(_KEPT)
 def read2(servo: int, address: int, length: int) -> bytes:
-    """Return a read of one servo of Protocol 2.0."""
+    """Return the packet of a read of one servo of Protocol 2.0."""
     return _built(_SDK2.readTx, servo, address, length)
 
 
 @lru_cache(_KEPT)
 def sync_read2(address: int, length: int, servos: tuple[int, ...], fast: bool) -> bytes:
-    """Return a read of several servos of Protocol 2.0."""
+    """Return the packet of a read of several servos of Protocol 2.0."""
     return _built(_SDK2.syncReadTx, address, length, servos, len(servos), fast)
 
 

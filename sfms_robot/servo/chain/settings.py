@@ -1,12 +1,12 @@
-"""The values that the registers of each servo should hold while the bus runs, and whether they do.
+"""The values that the registers of each servo should hold while the bus runs, and the check that they do.
 
 Startup has written most of them. Three change while the bus runs: torque of servos that are to be limp, the watchdog,
-and the force of a servo that is reduced. They are written in every poll until the servo reports the value: first the
-write, unprompted and to all servos in one packet; only then it is read back, as far as the poll has time. Values are
-absolute, so that writing one twice does no harm.
+and the force of a servo that is reduced. Each is written in every poll until the servo reports the value. The write
+goes to all servos in one packet, and does not wait for a read; then the registers are read back, as far as the poll has
+time. Values are absolute, so writing one twice does no harm.
 
-All other registers are read back once a second, of several servos at once, as many as the rest of a poll has time for,
-and at most one request in a poll. A register that differs is a named fault.
+All other registers are read back once a second, by at most one request in a poll, which reads as many servos as the
+rest of the poll has time for. A register that differs is a named fault.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from sfms_robot.servo.policy import torque_register
 from sfms_robot.servo.registers import Field, span_of
 
 BUS_WATCHDOG: Final = "bus_watchdog"
-_VERIFIED: Final = 8  # servos that are read back in one poll
-_ROUND_S: Final = 1.0  # in which all servos are compared once
-_TOGETHER: Final = 8  # servos in one request
+_VERIFIED: Final = 8  # servos whose write is read back in one poll
+_ROUND_S: Final = 1.0  # time in which all servos are compared once
+_TOGETHER: Final = 8  # servos compared by one request
 _BLOCK: Final = 40  # bytes of one servo in one request, at most
 
 
@@ -32,9 +32,9 @@ class Settings:
     """The settings of the servos of one bus, by id.
 
     Args:
-        members: of the bus; their tables may be replaced while it runs.
+        members: members of the bus; their tables may be replaced while it runs.
         torque: the register of torque enable.
-        poll: reads registers back in what is left of its time.
+        poll: reads registers back in the rest of its time.
     """
 
     def __init__(self, members: Sequence[Member], torque: Field, poll: StatusPoll) -> None:
@@ -42,11 +42,11 @@ class Settings:
         self._members = {member.id: member for member in members}
         self._torque = torque
         self._pending: dict[str, dict[int, tuple[Field, int]]] = {}  # writes not confirmed yet, by register name
-        self._read_first = set[tuple[int, str]]()  # of them, those that are not written before they are read
-        self._changed: dict[int, dict[str, int]] = {}  # values other than those of startup
+        self._read_first = set[tuple[int, str]]()  # (id, name) of pending writes that are read before they are written
+        self._changed: dict[int, dict[str, int]] = {}  # values that replace those of startup
         self._differing: dict[int, dict[str, tuple[int, int]]] = {}  # (seen, wanted) by name
         self._round: list[tuple[Block, int]] = []  # reads of one servo each, still to be made in this round
-        self._part_s = _ROUND_S  # of a round that one servo's block takes
+        self._part_s = _ROUND_S  # share of a round for one block of one servo
         self._due_s = 0.0
 
     def wanted(self, servo: int) -> Mapping[str, int]:
@@ -54,7 +54,7 @@ class Settings:
         return {**self._members[servo].startup.wanted(), **self._changed.get(servo, {})}
 
     def changed(self, name: str) -> list[int]:
-        """Return the servos that were given another value than 0 in a register."""
+        """Return the ids of servos in which a register was changed to another value than 0."""
         return [servo for servo, values in self._changed.items() if values.get(name)]
 
     def forget(self, servo: int) -> None:
@@ -72,7 +72,7 @@ class Settings:
     # --- written until they are confirmed -----------------------------------------------------------------------
 
     def command(self, now_s: float) -> None:
-        """Write torque off and less force, then read them back; again in the next poll unless it is confirmed.
+        """Write torque off and less force, then read them back. Later polls repeat this until it is confirmed.
 
         Raises BusError if the port fails.
         """
@@ -89,7 +89,7 @@ class Settings:
 
     def _write(self, name: str, requests: dict[int, tuple[Field, int]], now_s: float) -> None:
         """Write all requests of one register, and read back those of listed members."""
-        # One packet has one address and one length: models with another address get another packet.
+        # One packet has one address and one length, so models with another address get another packet.
         for field in dict.fromkeys(field for field, _ in requests.values()):
             values = {servo: value for servo, (each, value) in requests.items() if each == field}
             written = {s: field.to_bytes(v) for s, v in values.items() if (s, name) not in self._read_first}
@@ -102,11 +102,11 @@ class Settings:
                     self._read_first.discard((servo, name))
                     request = requests.pop(servo)
                     if (value := field.from_bytes(answer.data)) != request[1]:
-                        requests[servo] = request  # to the back: the others have their turn
+                        requests[servo] = request  # to the end, so that the others have their turn
                     self._seen(self._members[servo], name, value, now_s)
 
     def _seen(self, member: Member, name: str, value: int, now_s: float) -> None:
-        """Take the value of a register that was written."""
+        """Process the value that was read back from a written register."""
         if name == self._torque.name:
             member.take_torque(bool(value), now_s)
         elif name == BUS_WATCHDOG and value < 0:  # it has tripped
@@ -114,7 +114,7 @@ class Settings:
             member.distrust(now_s)
 
     def arm(self, servos: Iterable[int], watchdog: int) -> None:
-        """Set the watchdogs that stop the servo."""
+        """Arm the watchdogs of `servos`, of those models whose watchdog stops the servo."""
         armed = self.changed(BUS_WATCHDOG)
         for servo in servos:
             if servo not in armed and self._members[servo].startup.table.watchdog == "stops":
@@ -127,7 +127,7 @@ class Settings:
             self._read_first.add((servo, BUS_WATCHDOG))
 
     def _reduce(self, member: Member) -> None:
-        """Halve the force that startup gave a servo: one value, however often this is called."""
+        """Halve the force that startup set for a servo. Further calls change nothing."""
         fields = member.startup.table.fields
         bounded = member.servo.safety.current_limit_mA is not None and "goal_current" in fields
         field = fields["goal_current"] if bounded else torque_register(member.startup.table)
@@ -135,14 +135,14 @@ class Settings:
             self._change(member.id, field.name, self.wanted(member.id).get(field.name, field.high) // 2)
 
     def _change(self, servo: int, name: str, value: int) -> None:
-        """Give a register another value than startup did, from now on."""
+        """Request another value for a register than that of startup, from now on."""
         self._changed.setdefault(servo, {})[name] = value
         self._pending.setdefault(name, {})[servo] = self._members[servo].startup.table[name], value
 
     # --- compared once a second ---------------------------------------------------------------------------------
 
     def compare(self, now_s: float) -> None:
-        """Read a poll's share of a round. A servo that does not answer is read in the next round."""
+        """Read and compare a poll's share of a round. A servo that does not answer is read in the next round."""
         if now_s < self._due_s:
             return
         if not self._round:
@@ -162,7 +162,7 @@ class Settings:
                 self._judge(servo, where[0], answer.data)
 
     def _compared_blocks(self, servo: int) -> list[Block]:
-        """Return the blocks in which the registers of a servo are read: those close enough together are one."""
+        """Return the blocks in which the registers of a servo are read. Registers close together share a block."""
         groups: list[list[Field]] = []
         fields = self._members[servo].startup.table.fields
         names = self.wanted(servo) if _compared(self._members[servo]) else ()
@@ -174,7 +174,7 @@ class Settings:
         return [span_of(group) for group in groups]
 
     def _judge(self, servo: int, start: int, data: bytes) -> None:
-        """Compare the registers of a member; one that was changed while the bus runs is written once more."""
+        """Compare the registers of a member; write one again if it was changed while the bus runs."""
         differing, member = self._differing.setdefault(servo, {}), self._members[servo]
         for name, value in self.wanted(servo).items():
             field = member.startup.table.fields.get(name)

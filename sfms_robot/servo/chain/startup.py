@@ -1,15 +1,15 @@
 """Startup of the servos of a chain: identify, verify, prepare, enable.
 
-    identify   the servos that answer, each of the model in the head's file and of a known firmware
-    verify     what the unit stores against the head's file (`stored_settings`): refused by name, or a warning if it
-               only weakens protection
-    prepare    mode, profile, torque limit and the registers of the head's file, each written and read back
-    enable     goal := present, then torque: no jump. A servo that stands outside its own limits, as of a sagged head,
+    identify   find the servos that answer; each must be of the model in the head's file and of a known firmware
+    verify     compare the stored values with the head's file (`stored_settings`): an error that names the value, or a
+               warning if the value only weakens protection
+    prepare    write and read back the mode, the profile, the torque limit and the registers of the head's file
+    enable     goal := present, then torque: no jump. A servo that stands outside its own limits, as in a sagged head,
                cannot hold there: its own profile moves it inside, slowly
 
-The same steps bring a servo back that was away. They are generators (`Steps`): between two exchanges on the wire they
-yield the seconds they should wait. At startup they are run through; while the bus is running, a tick takes a few of
-them besides its own work.
+The same steps bring back a servo that was lost. They are generators (`Steps`): between two exchanges on the wire they
+yield the seconds to wait. At startup they run to their end; while the bus is running, a tick makes a few of them in
+addition to its own work.
 
 A servo outside its own position limits is moved inside by these registers:
 
@@ -47,13 +47,13 @@ log = logging.getLogger(__name__)
 
 PATIENCE_S: Final = 0.05  # an adapter may hold an answer back for 16 ms
 LONGEST_READ: Final = 64
-SPEED_DEG_S: Final = 20.0  # of the shaft of a servo that is moved inside its limits
-INSIDE_DEG: Final = 1.0  # a servo under load hangs a little short of its goal, and friction stops it there
-_RAMP_S: Final = 0.25  # to `SPEED_DEG_S`
-_SLACK_S: Final = 1.0  # beyond twice the time that the way should take
-_LOOK_S: Final = 0.05  # between two looks at a servo that is moved inside its limits
-_STILL_TICKS: Final = 1  # between two looks: it stands
-_AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the last registers of 2.0 that are read
+SPEED_DEG_S: Final = 20.0  # speed of the shaft of a servo that is moved inside its limits
+INSIDE_DEG: Final = 1.0  # from the limit to the goal: load and friction stop a servo a little short of its goal
+_RAMP_S: Final = 0.25  # time to reach `SPEED_DEG_S`
+_SLACK_S: Final = 1.0  # added to twice the time that the way should take
+_LOOK_S: Final = 0.05  # between two position reads of a servo that is moved inside its limits
+_STILL_TICKS: Final = 1  # largest change between two reads of a servo at rest
+_AT_REST: Final = ("torque_enable", "present_position", "error_status")  # the snapshot of 2.0 ends at the last of them
 _BY_TIME: Final = 0x04  # drive mode bit 2: the profile registers are durations
 
 
@@ -68,12 +68,12 @@ class WayInside(NamedTuple):
 def way_inside(present: int, limits: tuple[int, int], turn_ticks: float) -> WayInside | None:
     """Return the shortest way from `present` to inside `limits`, ticks.
 
-    None if the nearer end is beyond the end of the turn: a servo counts its ticks straight, and would turn all the way
-    round the other side.
+    None if the nearer end is on the other side of the end of the turn: a servo counts its ticks without wrapping, and
+    would turn all the way round in the other direction.
     """
     low, high = limits
     outside = max(low - present, present - high)
-    # The other way round is as long as what the turn has left beside the limits and this gap.
+    # The way in the other direction is as long as the turn without the limits' range and this gap.
     if 2 * outside > turn_ticks - (high - low):
         return None
     margin = min(round(INSIDE_DEG / 360.0 * turn_ticks), (high - low) // 2)
@@ -101,19 +101,19 @@ def slow_profile(table: Table, drive_mode: int, distance_deg: float) -> Values:
 
 
 class Startup(ABC):
-    """Requests that start up one servo.
+    """The requests that start up one servo.
 
     Args:
-        servo: its joint, id, control table, limits and safety.
-        needs: of its joint.
-        warnings: joints by what their servos store that only weakens protection; filled here.
-        others: returns the startups of known servos that are being started up too.
+        servo: the servo with its joint, id, control table, limits and safety.
+        needs: requirements of its joint.
+        warnings: a stored value that only weakens protection -> joints; filled here.
+        others: returns the startups of other known servos that are being started up.
 
     Attributes:
-        link: to the wire; set before the first request.
-        table: a protocol whose servos report their firmware replaces it by that of another layout.
-        can_reboot: whether the protocol has an instruction for it.
-        unlimited: registers of speed and acceleration, in which 0 means unlimited.
+        link: link over the wire; set before the first request.
+        table: control table. If the servo reports a firmware with another layout, it is replaced by that table.
+        can_reboot: whether the protocol has a reboot instruction.
+        unlimited: registers of speed and acceleration in which 0 means unlimited.
     """
 
     can_reboot: ClassVar[bool]
@@ -135,20 +135,21 @@ class Startup(ABC):
 
     @abstractmethod
     def _read_state(self) -> Steps[dict[str, int]]:
-        """Make the servo answer, and return the values of its registers, at least those up to present position."""
+        """Make the servo answer; return the values of its registers, at least of those up to the present position."""
 
     @abstractmethod
     def _defaults(self, now: Values) -> Values:
-        """Return register values before torque, in any head; `now`: their values."""
+        """Return the values that registers get before torque, in any head; `now`: their present values."""
 
     @abstractmethod
     def _find_again(self, reboot: bool) -> Steps[None]:
-        """Identify a servo that was away. Raises Silent, ServoError."""
+        """Identify a servo that was lost. Raises Silent, ServoError."""
 
     def prepare(self) -> Steps[int]:
-        """Verify what is stored, write settings, and return the latched faults. Torque is left unchanged.
+        """Verify the stored values, write settings, and return the latched faults.
 
-        Raises ServoError for a stored value that contradicts the head's file.
+        Torque is left unchanged, except in `_release_outside`. Raises ServoError for a stored value that contradicts
+        the head's file.
         """
         now = yield from self._release_outside((yield from self._read_state()))
         settings = {**self._corrections(now), **self._defaults(now), **self.wanted()}  # the mode first
@@ -160,12 +161,12 @@ class Startup(ABC):
                 yield 0.0
             written = yield from self._set(now, name, target)
             if written and self.table.protocol == 2 and name == self._name("operating_mode"):
-                now = yield from self._snapshot()  # another mode resets gains, profile and goals
+                now = yield from self._snapshot()  # a change of mode resets gains, profile and goals
         error = self.table.role("error_status") if self.table.protocol == 2 else None
         return now[error.name] if error is not None else 0
 
     def bring_back(self, reboot: bool) -> Steps[int]:
-        """Start up a servo that was away: same model, settings, torque on; return the position held, in ticks.
+        """Start up a servo that was lost: model, settings, torque on, all verified; return the position held, in ticks.
 
         Raises Silent, and ServoError as `prepare` and `torque_on`.
         """
@@ -178,18 +179,18 @@ class Startup(ABC):
         """Write goal := present, read it back, switch torque on, read it back; return the position held, in ticks.
 
         A servo that stands outside its own limits is moved inside first, at `SPEED_DEG_S`, which takes its time. Raises
-        ServoError, with torque off, for one that does not arrive, or has no speed register.
+        ServoError, with torque off, for a servo that does not arrive or has no speed register.
         """
         limits = self.own_limits()
         yield 0.0
-        present = self.value(self._field("present_position"))  # from here on without a pause
+        present = self.value(self._field("present_position"))  # no pause from here on
         if limits is not None and not _inside(present, limits):
             return (yield from self._move_inside(present, limits))
         yield from self._enable_at(present)
         return present
 
     def _enable_at(self, goal: int) -> Steps[None]:
-        """Write the goal first, since some servos switch their torque on when it is written."""
+        """Write the goal, then torque on, in this order because some servos switch torque on when a goal is written."""
         yield from self._write(self._field("goal_position"), goal)
         yield from self._restore_torque()
         yield from self._write(self._field("torque_enable"), 1)
@@ -197,8 +198,8 @@ class Startup(ABC):
     def _move_inside(self, start: int, limits: tuple[int, int]) -> Steps[int]:
         """Write a slow profile, switch torque on with a goal just inside, and wait until the servo stands there.
 
-        Then goal := present and the usual profile; returns the position held. Whatever ends it before, also a caller
-        that closes it, leaves torque off.
+        Then write goal := present and the usual profile; return the position held. If this ends early, also because the
+        caller closes the generator, torque is switched off.
         """
         table = self.table
         drive_mode = table.fields.get("drive_mode")
@@ -231,7 +232,7 @@ class Startup(ABC):
         return present
 
     def _arrival(self, way: WayInside, limits: tuple[int, int]) -> Steps[int | None]:
-        """Return where it stands inside its limits; None if it does not arrive in time, or loses its torque."""
+        """Return the position at which it stops inside its limits; None if it arrives too late or loses its torque."""
         torque, position = self._field("torque_enable"), self._field("present_position")
         before: int | None = None
         for _ in range(math.ceil(way.bound_s / _LOOK_S)):
@@ -248,7 +249,7 @@ class Startup(ABC):
     def _release_outside(self, now: dict[str, int]) -> Steps[dict[str, int]]:
         """Switch torque off if a servo stands outside its own limits under torque with a slow profile.
 
-        It was lost while it was moved inside, and with its usual profile it would jump. Returns `now`, updated.
+        Such a servo was lost while it was moved inside, and would jump with its usual profile. Returns `now`, updated.
         """
         limits, torque, usual = self._limits(now), self._field("torque_enable"), self.wanted()
         slow = any(now[name] != usual.get(name, 0) for name in slow_profile(self.table, 0, 0.0))
@@ -259,13 +260,13 @@ class Startup(ABC):
         return {**now, torque.name: 0}
 
     def _restore_torque(self) -> Steps[None]:
-        """Restore what a servo reset when it shut down."""
+        """Restore the registers that a servo reset when it shut down."""
         yield from ()
 
     # --- settings -----------------------------------------------------------------------------------------------
 
     def wanted(self) -> Values:
-        """Return registers and values that are to be in force while the bus runs.
+        """Return the register values that should be in force while the bus runs.
 
         These are mode, profile, torque limit, and the registers of the head's file. Raises ServoError for a register
         that the model does not have.
@@ -283,9 +284,9 @@ class Startup(ABC):
         return {**{name: value for name, value in wanted.items() if name in table.fields}, **safety.registers}
 
     def _set(self, now: Values, name: str, target: int) -> Steps[bool]:
-        """Write a register that holds another value; return whether it was written. `now`: their values.
+        """Write a register that holds another value; return whether it was written. `now`: present values.
 
-        Raises ServoError for one of the EEPROM under torque.
+        Raises ServoError for a register of the EEPROM under torque.
         """
         field, delay = self.table[name], name == self._name("return_delay")
         if now[name] == target:
@@ -295,9 +296,9 @@ class Startup(ABC):
                 return False  # slower, but not a reason to switch torque off
             raise self._error(f"has torque on and {name} {now[name]}, must be {target}: release it first")
         if delay:
-            # The delay of all servos that are being started up goes into one packet; each still verifies it. With the
-            # factory delay of 0.5 ms each, reading 28 servos takes longer than a tick, and a startup takes 20 reads.
-            # If an EEPROM lock is closed (Feetech), the value holds until the servo loses its supply.
+            # The delay of all servos that are being started up is written in one packet; each startup still verifies
+            # it. With the factory delay of 0.5 ms each, reading 28 servos takes longer than a tick, and a startup takes
+            # 20 reads. If an EEPROM lock is closed (Feetech), the value is kept until the servo loses its supply.
             data = field.to_bytes(target)
             alike = {each.servo.id: data for each in self._others() if each.table.role("return_delay") == field}
             if alike:
@@ -310,7 +311,7 @@ class Startup(ABC):
         return self._limits({name: self.value(self.table[name]) for name in limit_names(self.table) or ()})
 
     def _limits(self, values: Values) -> tuple[int, int] | None:
-        """Return `own_limits` of registers that have been read."""
+        """Return the limits as `own_limits` does, from registers that have been read."""
         names = limit_names(self.table)
         if names is None or not limits_count(self.table, self._needs):
             return None
@@ -318,7 +319,7 @@ class Startup(ABC):
         return (low, high) if low < high else None
 
     def _corrections(self, values: Values) -> Values:
-        """Return the registers that startup corrects, warn of others. Raises ServoError for a contradiction."""
+        """Return the registers that startup corrects; warn about others. Raises ServoError for a contradiction."""
         servo = self.servo
         found = contradictions(values, self.table, self._needs)
         for each in found:
@@ -335,18 +336,18 @@ class Startup(ABC):
     # --- exchanges ----------------------------------------------------------------------------------------------
 
     def ping(self) -> Found | None:
-        """Return the servo that answers; None if there is none."""
+        """Ping the servo; return its identity, or None if it does not answer."""
         return self.link.ping(self.servo.id)
 
     def recognise(self, found: Found) -> None:
-        """Raise ServoError for another model. One without a number passes for any."""
+        """Raise ServoError for another model. A model without a number accepts any servo."""
         table = self.table
         if table.model_number is not None and found.model_number != table.model_number:
             wanted = f"the head says {table.model} ({table.model_number})"
             raise self._error(f"is model number {found.model_number}, {wanted}")
 
     def _snapshot(self) -> Steps[dict[str, int]]:
-        """Return the values of the registers, in as few reads as possible; of 2.0 those up to `_AT_REST`."""
+        """Return the values of the registers, in as few reads as possible; for 2.0 only up to those in `_AT_REST`."""
         end, memory = self.table.size, bytearray()
         if self.table.protocol == 2:
             fields = [field for role in _AT_REST if (field := self.table.role(role)) is not None]
@@ -358,7 +359,7 @@ class Startup(ABC):
         return {each.name: each.from_bytes(memory[each.address :]) for each in inside}
 
     def value(self, field: Field) -> int:
-        """Return the value of one register. Raises Silent, ServoError if it is refused."""
+        """Return the value of one register. Raises Silent; ServoError if the read is refused."""
         return field.from_bytes(self._read(field.name, field.address, field.size))
 
     def _read(self, what: str, address: int, length: int) -> bytes:
@@ -402,10 +403,11 @@ def _inside(ticks: int, limits: tuple[int, int]) -> bool:
 def start_up(bus: str, link: RegisterLink, startups: Sequence[Startup], baud: int) -> dict[int, int]:
     """Identify, verify and prepare every servo of a bus; torque is left unchanged.
 
-    Returns latched faults, as bits of the table's faults (0 if the protocol has no such register), by index of the
-    servos that answered. Each one that does not takes `TRIES` times `PATIENCE_S`. `bus` and `baud` are for messages.
+    Returns the latched faults by index of the servos that answered, as bits of the table's faults (0 if the protocol
+    has no such register). A servo that does not answer costs `TRIES` times `PATIENCE_S`. `bus` and `baud` are for
+    messages.
 
-    Raises BusError if no servo answers, ServoError for one that contradicts the head's file.
+    Raises BusError if no servo answers, ServoError for a servo that contradicts the head's file.
     """
     found: dict[int, Found] = {}
     bits: dict[int, int] = {}
@@ -428,7 +430,7 @@ def start_up(bus: str, link: RegisterLink, startups: Sequence[Startup], baud: in
 
 
 def needs_of(servos: Sequence[BusServo], conversion: TickConversion, faults: Faults) -> list[JointNeeds]:
-    """Return what each joint of a bus requires of its servo; `faults`: those that the head acts upon."""
+    """Return what each joint of a bus requires of its servo; `faults`: the faults that the head acts upon."""
     ids = frozenset(servo.id for servo in servos)
     return [
         JointNeeds(

@@ -2,7 +2,7 @@
 
 The registers that change are close together in every table, so one read of a block gets all of them. Servos of one bus
 may be of different models if those registers have the same addresses; the meaning of a raw value (mA per tick, ticks
-per turn) is each model's own. Every register has its own sign rule, and the series differ in byte order.
+per turn) depends on the model. Every register has its own sign rule, and the series differ in byte order.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sfms_robot.servo.registers import Field, Table, span_of
 Block = tuple[int, int]  # address, length
 
 _NEEDED: Final = ("present_position", "goal_position", "torque_enable")
-_REACH: Final = 8  # bytes by which a block grows for the present current: fewer than a request for it takes
+_REACH: Final = 8  # bytes by which a block may grow for the present current: fewer than a separate request takes
 _EXTRA: Final = ("current_mA", "load_percent", "velocity_rad_s", "voltage_V", "temperature_C")
 _CURRENT, _PERCENT, _VELOCITY, _VOLTAGE, _TEMPERATURE = range(5)  # rows of `Telemetry.extra`
 _CAPABILITIES: Final = {_CURRENT: "current", _VELOCITY: "velocity", _VOLTAGE: "voltage", _TEMPERATURE: "temperature"}
@@ -34,18 +34,18 @@ class Telemetry:
 
     Args:
         bus: its name, for messages.
-        family, protocol: of the servos of this bus, as in a firmware map.
-        tables: of each servo.
+        family, protocol: those of the servos of this bus, as in a firmware map.
+        tables: control table of each servo.
         conversion: joint angles <-> ticks.
 
     Attributes:
         position: (address, length) of the present position alone.
-        block: that of all registers read together, position included.
-        health: that of torque enable, up to the hardware error status if there is one.
-        goal, torque, error: registers, the same for all servos; `error` None if faults come with every answer.
-        currents: per servo the register of its present current if that is outside the block.
+        block: (address, length) of all registers read together, position included.
+        health: (address, length) of torque enable, up to the hardware error status if there is one.
+        goal, torque, error: registers, the same for all servos; `error` is None if faults come with every answer.
+        currents: register of the present current of each servo, if it is outside the block; else None.
         ticks: (J,) last position.
-        seen_s: (J,) when it came, -inf before the first.
+        seen_s: (J,) time of that position, -inf before the first.
         extra: (5, J) `current_mA`, `load_percent`, `velocity_rad_s`, `voltage_V`, `temperature_C`; NaN if not known.
 
     Raises ConfigError for servos of another family, or with other addresses of these registers.
@@ -69,7 +69,7 @@ class Telemetry:
         common(bus, tables, "bus_watchdog")
         # Angles are affine in ticks, so two conversions give the angle of one tick.
         zero, one = (conversion.to_rad(np.full(len(tables), ticks, np.int64)) for ticks in (0, 1))
-        # Protocol 2.0 has current or load at one address; the others have load, and perhaps a current in mA besides.
+        # Protocol 2.0 has current or load at one address; the others have load, and some also a current in mA.
         loads = [(protocol == 2 and table.role("present_current")) or table.role("present_load") for table in tables]
         apart = [table.role("present_current") if protocol == 1 and tells_current(table) else None for table in tables]
         currents = loads if protocol == 2 else apart
@@ -77,7 +77,7 @@ class Telemetry:
             [table.role(role) for table in tables] for role in ("present_speed", "voltage", "temperature")
         )
         ticks_s = [table.in_ticks(field) if field else math.nan for table, field in zip(tables, speeds, strict=True)]
-        sources = {  # row of `extra` -> register of each servo, and what its raw value is multiplied with
+        sources = {  # row of `extra` -> register of each servo, and the factor of its raw value
             _CURRENT: (currents, _scales(currents, "mA")),
             _PERCENT: (loads, _scales(loads, "percent")),
             _VELOCITY: (speeds, (one - zero) * np.array(ticks_s)),
@@ -106,12 +106,12 @@ class Telemetry:
         self.extra = np.full((len(_EXTRA), len(tables)), np.nan)
 
     def forget(self) -> None:
-        """Forget all reports: another connection."""
+        """Forget all reports, before another connection."""
         self.seen_s[:] = -np.inf
         self.extra[:] = np.nan
 
     def capabilities(self, index: int) -> frozenset[str]:
-        """Return what a servo reports or does, as `ports.Bus`."""
+        """Return the capabilities of a servo; see `ports.Bus`."""
         known = {
             name
             for _, _, row, scales in self._columns
@@ -120,12 +120,12 @@ class Telemetry:
         return frozenset({"position", "torque", *known} | ({"current"} if self.currents[index] is not None else set()))
 
     def take(self, where: Block, indices: Sequence[int], data: Sequence[bytes], now_s: float) -> None:
-        """Decode answers to a read of `where`, `position` or `block`; `data` hold its whole length."""
+        """Decode answers to a read of `where`, `position` or `block`; each of `data` has its whole length."""
         rows = b"".join(data)
         at = np.asarray(indices, np.intp)
         self.ticks[at] = _values(*self._present, rows, where)
         self.seen_s[at] = now_s
-        if where == self.block:  # the position alone brings nothing else
+        if where == self.block:  # a read of the position alone has nothing else
             for field, raw_type, row, scales in self._columns:
                 self.extra[row][at] = _values(field, raw_type, rows, where) * scales[at]
 
@@ -140,7 +140,7 @@ class Telemetry:
         return bool(self.torque.from_bytes(data[self.torque.address - start :])), bits
 
     def measured(self, index: int) -> dict[str, float]:
-        """Return what is known of the quantities that faults have thresholds for, by fault: see `policy.counts`."""
+        """Return the known values that are compared with thresholds of faults, by fault: see `policy.counts`."""
         values = {"input voltage": self.extra[_VOLTAGE, index], "overheating": self.extra[_TEMPERATURE, index]}
         return {fault: float(value) for fault, value in values.items() if math.isfinite(value)}
 
@@ -150,13 +150,13 @@ class Telemetry:
         return currents
 
     def supply_mA(self) -> float:
-        """Return the sum of the known motor currents: an upper bound of what the servos take from the supply."""
+        """Return the sum of the known motor currents: an upper bound of the current from the supply."""
         return sum(abs(current) for current in self.currents_mA() if current == current)
 
     def readings(
         self, joints: Sequence[str], faults: Sequence[str | None], rejoined: set[int], now_s: float
     ) -> Readings:
-        """Return the readings of all joints; `rejoined`: indices of those that came back in this poll."""
+        """Return the readings of all joints; `rejoined`: indices of servos that came back in this poll."""
         angles = self._conversion.to_rad(self.ticks).tolist()
         ages = (now_s - self.seen_s).tolist()
         extras = self.extra.T.tolist()
@@ -173,7 +173,7 @@ class Telemetry:
 def common(bus: str, tables: Sequence[Table], role: str) -> Field | None:
     """Return the register of a role, the same for all servos of a bus, since one request has one address.
 
-    None if none has it. Raises ConfigError if addresses or forms differ.
+    The result is None if no servo has it. Raises ConfigError if addresses or forms differ.
     """
     first = tables[0].role(role)
     for table in tables[1:]:
@@ -192,18 +192,18 @@ def _alike(field: Field | None, other: Field | None) -> bool:
 
 
 def _scales(fields: Sequence[Field | None], unit: str | None = None) -> Doubles:
-    """Return the scale of each register; NaN for one that is missing, or has another unit."""
+    """Return the scale of each register; NaN for a register that is missing or has another unit."""
     return np.array([field.scale if field and unit in (None, field.unit) else math.nan for field in fields])
 
 
 def raw_type(field: Field) -> np.dtype[Any]:
-    """Return the type of the raw form of a register in an array."""
+    """Return the array type of the raw values of a register."""
     kind = ("<", ">")[field.byte_order == "big"] + ("u", "i")[field.signed == "twos_complement"]
     return np.dtype(f"{kind}{field.size}")
 
 
 def _values(field: Field, raw_type: np.dtype[Any], rows: bytes, where: Block) -> NDArray[Any]:
-    """Return the values of a register in rows that were each read from `where`, as `Field.from_bytes` of one."""
+    """Return the values of a register in rows that were each read from `where`, as `Field.from_bytes` does for one."""
     start, length = where
     raw: NDArray[Any] = np.ndarray(len(rows) // length, raw_type, rows, field.address - start, strides=(length,))
     if field.signed == "offset_2048":  # 2048 stands for 0 (MX current)

@@ -12,16 +12,16 @@ Parameters, by the manual's names (words low byte first):
     ACTION, REBOOT    none                          status: no data
     FACTORY RESET     FF all, 01 all but the id, 02 all but id and baud rate
     CLEAR             01 44 58 4C 22                present position back into one turn
-    SYNC WRITE        address (2), length (2), then id, data of each; sent to id FE, none answers
+    SYNC WRITE        address (2), length (2), then id, data of each; sent to id FE, no servo answers
     SYNC READ         address (2), length (2), then ids; sent to id FE, one status of each, in that order
     FAST SYNC READ    the same; one status from id FE: ERROR, ID, data, CRC of each
 
-1. `length` counts instruction, parameters and crc, after stuffing. Words travel low byte first.
-2. A status packet is instruction 0x55 whose first parameter is the error byte; bit 7 of it is the alert.
+1. `length` counts instruction, parameters and crc, after stuffing. Words are sent low byte first.
+2. A status packet is instruction 0x55, with the error byte as first parameter; bit 7 of the error byte is the alert.
 3. Stuffing: between instruction and crc, every FF FF FD is followed by one more FD, so the header FF FF FD 00
-   never appears inside a packet. The crc is over the stuffed bytes.
-4. A reader that lost its place looks for the next header; a header inside an unfinished packet means that the
-   packet was cut off, and reading continues at that header.
+   never appears inside a packet. The crc covers the stuffed bytes.
+4. A reader that has lost synchronization searches for the next header. A header inside an incomplete packet means that
+   the packet was cut off, and reading continues at that header.
 
 Source: ROBOTIS e-manual, docs/en/dxl/protocol2.md.
 """
@@ -35,7 +35,7 @@ from fastcrc.crc16 import umts
 
 from sfms_robot.errors import PacketError
 
-# Instructions, e-manual "Instruction"; 55 marks what a servo sends.
+# Instructions, e-manual "Instruction"; 55 marks packets sent by a servo.
 PING: Final = 0x01
 READ: Final = 0x02  # address (2), length (2)
 WRITE: Final = 0x03  # address (2), data
@@ -43,10 +43,10 @@ FACTORY_RESET: Final = 0x06
 REBOOT: Final = 0x08
 CLEAR: Final = 0x10  # with the key 44 58 4C 22
 STATUS: Final = 0x55
-SYNC_READ: Final = 0x82  # one block of several ids; each sends its own status
-SYNC_WRITE: Final = 0x83  # one address, other data for each id
-FAST_SYNC_READ: Final = 0x8A  # from a firmware on that differs by model
-BULK_READ: Final = 0x92  # another block of each id
+SYNC_READ: Final = 0x82  # the same block of several ids; each sends its own status
+SYNC_WRITE: Final = 0x83  # one address, different data for each id
+FAST_SYNC_READ: Final = 0x8A  # since a firmware version that depends on the model
+BULK_READ: Final = 0x92  # a different block of each id
 BULK_WRITE: Final = 0x93
 
 # Error byte of a status packet (byte 8): e-manual "Status Packet: Error".
@@ -68,16 +68,16 @@ ACCESS_ERROR: Final = 7
 
 BROADCAST: Final = 0xFE  # "Packet ID": ids are 0 to 252 (FC); FD and FF are reserved
 MAX_ID: Final = 252
-MAX_PACKET: Final = 1024  # bytes; a longer claim is noise, and this bounds what a reader holds
+MAX_PACKET: Final = 1024  # bytes; a longer length field is noise, and this limits the buffer of a reader
 STATUS_OVERHEAD: Final = 11  # bytes of a status packet without its data
 
 _HEADER: Final = b"\xff\xff\xfd\x00"  # "Header" and "Reserved"
-_LOOKALIKE: Final = b"\xff\xff\xfd"  # inside a packet; byte stuffing makes it the next one
+_LOOKALIKE: Final = b"\xff\xff\xfd"  # not allowed inside a packet: byte stuffing replaces it by `_STUFFED`
 _STUFFED: Final = b"\xff\xff\xfd\xfd"
 
 
 class Packet(NamedTuple):
-    """A packet. Of a status, `params` is the data behind the error byte; of an instruction, `error` is 0."""
+    """A packet. In a status, `params` is the data after the error byte; in an instruction, `error` is 0."""
 
     servo: int
     instruction: int
@@ -93,13 +93,13 @@ def encode_instruction(servo: int, instruction: int, params: bytes = b"") -> byt
     body = (bytes([instruction]) + params).replace(_LOOKALIKE, _STUFFED)
     if len(body) + 9 > MAX_PACKET:
         raise PacketError(f"a packet of {len(body) + 9} bytes is longer than {MAX_PACKET}")
-    # LEN = instruction + parameters + crc, after stuffing. The crc is over everything from byte 0 on.
+    # LEN = instruction + parameters + crc, after stuffing. The crc covers all bytes from byte 0 on.
     packet = _HEADER + bytes([servo]) + (len(body) + 2).to_bytes(2, "little") + body
     return packet + crc16(packet).to_bytes(2, "little")
 
 
 def encode_sync_write(address: int, length: int, rows: bytes) -> bytes:
-    """Return a sync write; `rows` are id and `length` bytes of data of each servo. Raises PacketError, as above."""
+    """Return a sync write; `rows` are id and `length` bytes of data of each servo. Raises PacketError if too long."""
     # address (2), length (2), then id and data of each: e-manual "Sync Write"
     head = address.to_bytes(2, "little") + length.to_bytes(2, "little")
     return encode_instruction(BROADCAST, SYNC_WRITE, head + rows)
@@ -113,8 +113,8 @@ def encode_status(servo: int, error: int, data: bytes = b"") -> bytes:
 def encode_fast_status(replies: Iterable[tuple[int, int, bytes]], length: int | None = None) -> bytes:
     """Return the one status packet that answers a fast sync read; `replies` are (id, error, data) in list order.
 
-    Each device appends error, id, data and the crc of everything so far; the last crc closes the packet. Nothing is
-    stuffed: a device cannot know what the ones before it sent. `length`: what LEN says where the packet stops short.
+    Each device appends error, id, data and the crc of all bytes so far; the last crc ends the packet. Stuffing is not
+    used, since a device cannot know the bytes of the devices before it. `length`: LEN of a truncated packet.
     """
     parts = [bytes([error, servo]) + data for servo, error, data in replies]
     if length is None:  # LEN counts from the instruction on: 1, then error, id, data and crc of each device
@@ -129,17 +129,17 @@ def encode_fast_status(replies: Iterable[tuple[int, int, bytes]], length: int | 
 def split_fast_status(data: bytes | bytearray, length: int) -> list[tuple[int, int, bytes]]:
     """Return (id, error, data) of each device in the answer to a fast sync read of `length` bytes.
 
-    `data` begins with the header. If a device is silent the packet stops short: the devices in front of the gap are
-    returned, each proved by the crc it sent, and none behind it.
+    `data` begins with the header. If a device is silent, the packet is truncated: the devices before the gap are
+    returned, each verified by its own crc, and none after the gap.
     """
     # FF FF FD 00 FE LEN LEN 55, then of each device ERROR ID data CRC CRC: 4 bytes and the data
     if not data.startswith(_HEADER + bytes([BROADCAST])) or data[7:8] != bytes([STATUS]):
         return []
     data, size = bytes(data), length + 4
     ends = range(8 + size, len(data) + 1, size)
-    whole = bool(ends) and _proved(data[: ends[-1]])  # the last crc is over everything
+    whole = bool(ends) and _proved(data[: ends[-1]])  # the last crc covers the whole packet
     out = []
-    for end in ends:  # behind the crc of one device
+    for end in ends:  # index after the crc of one device
         if not whole and not _proved(data[:end]):
             break
         out.append((data[end - size + 1], data[end - size], data[end - size + 2 : end - 2]))
@@ -153,8 +153,8 @@ def _proved(data: bytes) -> bool:
 def maybe_packet(buffer: bytearray) -> Packet | None:
     """Take the first whole packet off the front of `buffer`, or return None: more bytes are needed.
 
-    Noise in front of it is dropped, and so is a packet with a wrong crc. What stays in the buffer after None is at
-    most one unfinished packet, so a caller that empties it after each read holds a bounded number of bytes.
+    Noise before it is dropped, and so is a packet with a wrong crc. After None the buffer contains at most one
+    incomplete packet, so a caller that empties it after each read stores a bounded number of bytes.
     """
     while True:
         start = buffer.find(_HEADER)
@@ -163,16 +163,16 @@ def maybe_packet(buffer: bytearray) -> Packet | None:
             del buffer[: len(buffer) - begun]
             return None
         del buffer[:start]
-        if len(buffer) < 7:  # LEN_H, the last byte that says how long the packet is
+        if len(buffer) < 7:  # byte 6 is LEN_H, the last byte of the length
             return None
         servo, length = buffer[4], buffer[5] | buffer[6] << 8
-        total = length + 7  # LEN counts what is behind byte 6
-        if length < 3 or total > MAX_PACKET or servo in (0xFD, 0xFF):  # FD and FF are no ids: they look like a header
+        total = length + 7  # LEN counts the bytes after byte 6
+        if length < 3 or total > MAX_PACKET or servo in (0xFD, 0xFF):  # FD and FF are not ids: they look like a header
             del buffer[0]
             continue
         if len(buffer) < total:
             again = buffer.find(_HEADER, 7)
-            if 7 <= again <= total - 6:  # a header wholly in front of the crc: this packet was cut off
+            if 7 <= again <= total - 6:  # a whole header before the crc: this packet was cut off
                 del buffer[:again]
                 continue
             return None

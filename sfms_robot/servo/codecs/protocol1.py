@@ -5,26 +5,26 @@
           header
 
 1. LENGTH counts code, parameters and checksum. CHECKSUM is the inverse of the low byte of the sum of bytes 2 to n-2.
-2. Byte 4 is the instruction in what a host sends and the error byte in what a servo answers. The frame does not say
-   which of the two it is, nor what an answer answers: a reader has to know what it asked, which servo, and how long the
-   answer must be.
-3. Nothing is stuffed, so parameters may look like a header. After a frame with a wrong checksum, reading continues at
-   the next header behind its first byte.
+2. Byte 4 is the instruction in a frame of a host, and the error byte in the answer of a servo. The frame does not show
+   which of the two it is, nor which request it answers: a reader needs the request, its servo and the expected length
+   of the answer.
+3. Byte stuffing is not used, so parameters may look like a header. After a frame with a wrong checksum, reading
+   continues at the next header after its first byte.
 
-Parameters begin at byte 5. Both families have, to id FE, which no servo answers:
+Parameters begin at byte 5. Both families have this instruction to id FE, which no servo answers:
 
     SYNC WRITE (83)        start address, length L, then id and L bytes of data of each
 
 Dynamixel 1.0 sends words low byte first, and has no sync read:
 
-    BULK READ (92)         00, then length, id, start address of each: in this order, unlike everywhere else; to id FE,
-                           one status of each in the order asked, each waiting for the one before it; MX series only
+    BULK READ (92)         00, then length, id, start address of each (other instructions have another order); to id
+                           FE, one status of each in the order of the ids, each after the previous one; MX series only
 
-Feetech STS and SMS send words low byte first, SCS high byte first; the model decides (`byte_order` of its firmware
-map), as for the sign rule of each register:
+Feetech STS and SMS send words low byte first, SCS high byte first. This depends on the model (`byte_order` of its
+firmware map), and so does the sign rule of each register:
 
-    SYNC READ (82)         start address, length, then ids; to id FE, one status of each in that order. SCS do not
-                           answer it reliably
+    SYNC READ (82)         start address, length, then ids; to id FE, one status of each in that order. SCS servos do
+                           not answer it reliably
     RESET TURNS (0A)       none; STS only
     CALIBRATE OFFSET (0B)  none; the present position becomes the middle
 
@@ -44,7 +44,7 @@ PING: Final = 0x01
 READ: Final = 0x02  # address, length
 WRITE: Final = 0x03  # address, data
 REG_WRITE: Final = 0x04  # kept in the servo until ACTION
-ACTION: Final = 0x05  # carries out what REG WRITE has left
+ACTION: Final = 0x05  # executes the pending REG WRITE
 FACTORY_RESET: Final = 0x06
 SYNC_WRITE: Final = 0x83
 BULK_READ: Final = 0x92  # Dynamixel MX
@@ -58,8 +58,8 @@ OVERHEAD: Final = 6  # bytes of a frame without its parameters
 MAX_PARAMS: Final = 0xFF - 2
 MAX_FRAME: Final = OVERHEAD + MAX_PARAMS
 
-# Error byte of Dynamixel 1.0 (e-manual "Status Packet: Error"): four bits are about the request; 0, 2 and 5 about the
-# servo (voltage, overheating, overload). Feetech's are all states of the servo: none says that a request was refused.
+# Error byte of Dynamixel 1.0 (e-manual "Status Packet: Error"): four bits concern the request; bits 0, 2 and 5 concern
+# the servo (voltage, overheating, overload). All bits of Feetech are states of the servo: none reports a refusal.
 ANGLE_LIMIT: Final = 0x02  # bit 1: the goal is outside the angle limits
 RANGE: Final = 0x08  # bit 3: a parameter is out of range
 CHECKSUM: Final = 0x10  # bit 4
@@ -87,17 +87,17 @@ class Frame(NamedTuple):
 
 
 def encode(servo: int, code: int, params: bytes = b"") -> bytes:
-    """Return a frame. Raises PacketError for parameters that its length byte cannot count."""
+    """Return a frame. Raises PacketError for more parameters than its length byte can count."""
     if len(params) > MAX_PARAMS:
         raise PacketError(f"a frame of {len(params)} parameters is longer than {MAX_PARAMS}")
     body = bytes([servo, len(params) + 2, code]) + params
-    return _HEADER + body + bytes([~sum(body) & 0xFF])  # over ID to the last parameter, bytes 2 to n-2
+    return _HEADER + body + bytes([~sum(body) & 0xFF])  # covers bytes 2 to n-2: ID to the last parameter
 
 
 def maybe_frame(buffer: bytearray) -> Frame | None:
     """Take the first whole frame off the front of `buffer`, or return None: more bytes are needed.
 
-    What stays in the buffer after None is at most one unfinished frame, `MAX_FRAME` - 1 bytes.
+    After None the buffer contains at most one incomplete frame, `MAX_FRAME` - 1 bytes.
     """
     while True:
         start = buffer.find(_HEADER)
@@ -110,10 +110,10 @@ def maybe_frame(buffer: bytearray) -> Frame | None:
                 del buffer[0]
             return None
         servo, length = buffer[2], buffer[3]
-        if servo == 0xFF or length < 2:  # a third FF is still header; LENGTH counts code and checksum at least
+        if servo == 0xFF or length < 2:  # a third FF belongs to the header; LENGTH counts at least code and checksum
             del buffer[0]
             continue
-        total = length + 4  # LENGTH counts what is behind byte 3
+        total = length + 4  # LENGTH counts the bytes after byte 3
         if len(buffer) < total:
             return None
         if ~sum(buffer[2 : total - 1]) & 0xFF != buffer[total - 1]:
@@ -126,7 +126,7 @@ def maybe_frame(buffer: bytearray) -> Frame | None:
 
 
 def salvage(buffer: bytearray) -> list[Frame]:
-    """Empty a buffer to which nothing will be added; return the whole frames behind a beginning that was cut off."""
+    """Empty a buffer that receives no more bytes; return its whole frames, also those after an incomplete frame."""
     frames = []
     while buffer:
         frame = maybe_frame(buffer)
@@ -138,12 +138,12 @@ def salvage(buffer: bytearray) -> list[Frame]:
 
 
 def refusal_text(error: int) -> str:
-    """Return what an error byte of Dynamixel 1.0 says against the request; empty if it was taken."""
+    """Return why a request was refused, from an error byte of Dynamixel 1.0; empty if it was accepted."""
     return ", ".join(text for bit, text in REFUSALS.items() if error & bit)
 
 
 def encode_sync_write(address: int, length: int, rows: bytes) -> bytes:
-    """Return a sync write; `rows` are id and `length` bytes of data of each servo. Raises PacketError, as `encode`."""
+    """Return a sync write; `rows` are id and `length` bytes of data of each servo. Raises PacketError like `encode`."""
     # start address, L, then id and L bytes of each: e-manual "Sync Write"
     return encode(BROADCAST, SYNC_WRITE, bytes([address, length]) + rows)
 

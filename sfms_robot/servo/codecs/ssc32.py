@@ -4,10 +4,10 @@ r"""Lynxmotion SSC-32 and SSC-32U text commands: values in, bytes out, and back.
     #5 L \r                             output low: no pulses, the servo goes limp
     Q \r, QP 5 7 \r, VER \r             "." or "+" (still moving); one byte per channel in 10 us; a line of text
 
-Letters of either case, spaces anywhere, a carriage return ends the command and ESC drops what came before it.
+Letters of either case and spaces anywhere are allowed. A carriage return ends a command, ESC drops the bytes before it.
 
-Sources: Lynxmotion SSC-32U User Guide, "Servo Move or Group Move" and "Advanced Functions"; that `L` stops the pulses
-of a servo: community.robotshop.com/forum/t/ssc32-re-startup-condition/19731.
+Sources: Lynxmotion SSC-32U User Guide, "Servo Move or Group Move" and "Advanced Functions"; for the fact that `L` stops
+the pulses of a servo: community.robotshop.com/forum/t/ssc32-re-startup-condition/19731.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ CHANNELS: Final = 32  # <ch> 0..31
 MIN_PULSE_US: Final = 500  # <pw>, "pulse width in microseconds, 500 - 2500"
 MAX_PULSE_US: Final = 2500
 MAX_TIME_MS: Final = 65535  # <time>, "time in milliseconds to complete the move, 65535 maximum"
-MAX_LINE: Final = 1024  # bytes; a longer line is noise, and this bounds what a reader holds
+MAX_LINE: Final = 1024  # bytes; a longer line is noise, and this limits the buffer of a reader
 DONE: Final = b"."  # answers to Q, Query Movement Status
 MOVING: Final = b"+"
 
@@ -29,14 +29,14 @@ _CR: Final = 0x0D  # <cr> starts the action of a command
 _ESC: Final = 0x1B  # <esc> cancels the current command
 # # <ch> P <pw> S <spd>, Servo Move; # <ch> <lvl> with H or L, Discrete Output
 _ITEM: Final = re.compile(r"#(\d{1,2})(?:P(\d{1,5})(?:S(\d{1,5}))?|([HL]))")
-# the same in any number and T <time> behind them all, Servo Group Move
+# any number of these items, then T <time>: Servo Group Move
 _GROUP: Final = re.compile(r"((?:#\d{1,2}(?:P\d{1,5}(?:S\d{1,5})?|[HL]))+)(?:T(\d{1,5}))?")
 # QP <arg>, Query Pulse Width; several channels in one command
 _QUERY: Final = re.compile(r"QP\s*\d{1,2}(?:\s+\d{1,2})*")
 
 
 class Move(NamedTuple):
-    """A pulse width, and the speed towards it, us/s; 0 = as fast as the servo can."""
+    """A pulse width, and the speed towards it in us/s; 0 = as fast as the servo can move."""
 
     pulse_us: int  # <pw>
     speed_us_s: int = 0  # <spd>
@@ -62,7 +62,7 @@ class Query:
 def group_move(moves: Mapping[int, Move], time_ms: int = 0) -> bytes:
     """Return one command for all of `moves` (channel -> move), in its order; they start and stop together in `time_ms`.
 
-    Written without spaces: at 9600 baud each costs a millisecond.
+    The command has no spaces: at 9600 baud each would take a millisecond.
     """
     for channel, move in moves.items():
         if not MIN_PULSE_US <= move.pulse_us <= MAX_PULSE_US:
@@ -90,7 +90,7 @@ def query_moving() -> bytes:
 def maybe_command(buffer: bytearray) -> Group | Query | None:
     """Take the first whole command off the front of `buffer`, or return None: more bytes are needed.
 
-    Lines that are not commands are dropped, an endless one in pieces of `MAX_LINE` bytes.
+    Lines that are not commands are dropped; an endless line is dropped in pieces of `MAX_LINE` bytes.
     """
     while True:
         end = buffer.find(_CR)

@@ -1,4 +1,4 @@
-"""The AMI meeting annotations, seen from each listener: when he nods, looks, laughs, speaks, and when others speak.
+"""The AMI meeting annotations by listener: times of own nods, looks, laughs and speech, and of the others' speech.
 
 Reads the tables head_gestures, gaze_focus, words, dialogue_acts and participants (CSV, gzipped or not) of one folder.
 Times are seconds of the meeting; an interval table is (K, 2) start, end, sorted by start.
@@ -21,8 +21,8 @@ from sfms_robot.lab.corpora.collection import columns
 
 GAP_S: Final = 0.2  # shorter silences are part of a phrase
 NODS: Final = ("concord_signal nod", "concord_signal ")  # form nod, and form left blank
-_SHORT_S: Final = 0.6  # an isolated word
-_ALONE_S: Final = 0.5  # of silence before and after it
+_SHORT_S: Final = 0.6  # an isolated word is shorter
+_ALONE_S: Final = 0.5  # silence before and after an isolated word
 _COLUMNS: Final = {
     "participants": ("meeting", "agent", "participant", "head_annotated_until_s", "has_gaze_focus"),
     "head_gestures": ("meeting", "agent", "start_s", "end_s", "type", "form"),
@@ -30,7 +30,7 @@ _COLUMNS: Final = {
     "words": ("meeting", "agent", "start_s", "end_s", "kind", "text"),
     "dialogue_acts": ("meeting", "agent", "start_s", "end_s", "type"),
 }
-LabelledSpan = tuple[float, float, str]  # start, end [s], and what or which agent
+LabelledSpan = tuple[float, float, str]  # start, end [s], and a label or an agent
 LabelledSpans = tuple[LabelledSpan, ...]
 _Spans = dict[tuple[str, str], list[LabelledSpan]]
 
@@ -41,18 +41,18 @@ class MeetingPerson:
 
     Attributes:
         meeting, agent, participant: identity; `agent` is the letter used as a gaze target.
-        until_s: the head was annotated from 0 to here.
+        until_s: end of the head's annotation, which begins at 0.
         nods, shakes, tilts: head gestures (concord signal; discord or negative; other communicative). Some annotators
             left the form of a nod blank; where they did not, 98 % of concord signals are nods.
-        unseen: the head was off camera.
-        gaze: (start, end, target): an agent's letter, a place, or "" (unspecified); None where it was not annotated.
+        unseen: spans in which the head was off camera.
+        gaze: (start, end, target): an agent's letter, a place, or "" (unspecified); None if gaze was not annotated.
         laughs, talk, backchannels: the participant's own voice.
         others: phrases of all the others together, joined across gaps under 0.2 s.
         floor: (start, end, agent) phrases of each of the others.
         others_laughs: laughs of the others.
-        asked: ends of the others' acts that ask for something.
-        others_backchannels: of the others.
-        mm_hms: own isolated words under 0.6 s, silent for 0.5 s before and after.
+        asked: ends of the others' dialogue acts that ask for something.
+        others_backchannels: backchannels of the others.
+        mm_hms: own isolated words under 0.6 s, with 0.5 s of silence before and after.
         others_nods: (start, end, agent) nods of each of the others.
         looked_at: (start, end, agent) of each of the others looking at the participant.
         gaze_known: the others whose gaze was annotated.
@@ -84,7 +84,7 @@ class MeetingPerson:
 
 
 def read_people(folder: Path) -> list[MeetingPerson]:
-    """Return all persons whose head was annotated. Raises ConfigError naming the table, and a missing column."""
+    """Return all persons with a minute or more of head annotations. Raises ConfigError naming table and column."""
     gestures, gaze, words, acts = (
         _spans(folder, name) for name in ("head_gestures", "gaze_focus", "words", "dialogue_acts")
     )
@@ -136,12 +136,12 @@ def read_people(folder: Path) -> list[MeetingPerson]:
 
 
 def interval_table(spans: Iterable[Sequence[float]]) -> Doubles:
-    """Return (K, 2) of pairs (start, end)."""
+    """Return pairs (start, end) as an array (K, 2)."""
     return np.array(list(spans), np.float64).reshape(-1, 2)
 
 
 def phrases(spans: Iterable[tuple[float, float]]) -> Doubles:
-    """Return spans (K, 2) by start from spans in any order, overlapping ones and gaps under 0.2 s joined."""
+    """Return spans in any order as (K, 2), sorted by start, joined where they overlap or are less than 0.2 s apart."""
     joined: list[list[float]] = []
     for start, end in sorted(spans):
         if joined and start - joined[-1][1] < GAP_S:
@@ -152,7 +152,7 @@ def phrases(spans: Iterable[tuple[float, float]]) -> Doubles:
 
 
 def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
-    """Return the words (K, 2) of one person under 0.6 s with 0.5 s of silence on both sides."""
+    """Return one person's words (K, 2) that are shorter than 0.6 s and have 0.5 s of silence on both sides."""
     spans = interval_table(sorted(words))
     before = spans[:, 0] - np.r_[-np.inf, spans[:-1, 1]]
     after = np.r_[spans[1:, 0], np.inf] - spans[:, 1]
@@ -161,8 +161,9 @@ def isolated(words: Iterable[tuple[float, float]]) -> Doubles:
 
 
 def split_series(people: Iterable[MeetingPerson]) -> dict[Split, list[MeetingPerson]]:
-    """Return people by the split of their meeting (`clips.SERIES`); people of the training split are left out of the
-    others.
+    """Return people by the split of their meeting (`clips.SERIES`).
+
+    People of the training split are left out of the other splits.
     """
     parts = by_split((split_of(person.meeting), person) for person in people)
     seen = {person.participant for person in parts["train"]}
@@ -172,7 +173,7 @@ def split_series(people: Iterable[MeetingPerson]) -> dict[Split, list[MeetingPer
 
 
 def _of_others(spans: _Spans, others: Iterable[tuple[str, str]], wanted: tuple[str, ...]) -> LabelledSpans:
-    """Return (start, end, agent) of what the others did, by start."""
+    """Return (start, end, agent) of the others' spans with a wanted label, sorted by start."""
     return tuple(
         sorted((start, end, other[1]) for other in others for start, end, what in spans[other] if what in wanted)
     )
@@ -199,7 +200,7 @@ def _spans(folder: Path, name: str) -> _Spans:
 
 
 def _table(folder: Path, name: str) -> list[tuple[str, ...]]:
-    """Return the rows of a table, of each the `_COLUMNS`. Raises ConfigError."""
+    """Return the rows of a table with only its `_COLUMNS`. Raises ConfigError."""
     for file in (folder / f"{name}.csv.gz", folder / f"{name}.csv"):
         if file.is_file():
             break

@@ -1,20 +1,20 @@
-"""Composed dyads: real timing, real movement, put together here.
+"""Composed dyads: real timing and real movement, combined here.
 
-Recorded are: when a listener nods, laughs or says "mm-hm" while others talk, when they talk and pause, laugh and nod,
-and when they look at the listener (AMI meeting annotations); how a nod, a blink, a smile moves (recordings, `motions`);
-how speech sounds (`voices`). Their combination is ours: the voice says other words than the meeting did, only its
-phrases begin and end at the same times. Meetings, people, takes and voices kept for validation and test are whole ones
-(`clips.SERIES`).
+These parts are recorded: the times at which a listener nods, laughs or says "mm-hm" while others talk, at which the
+others talk and pause, laugh and nod, and look at the listener (AMI meeting annotations); the movement of a nod, a
+blink, a smile (recordings, `motions`); the sound of speech (`voices`). Their combination is ours: the voice says other
+words than were said in the meeting, only its phrases begin and end at the same times. Meetings, people, takes and
+voices kept for validation and test are kept whole (`clips.SERIES`).
 
 All others of a meeting become one speaker. The person with the floor sits straight ahead and looks at the listener
-when annotated so; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown, and so while
-no face is seen. Faces and microphones differ from dyad to dyad. Where the listener's gaze was not annotated, looks are
-drawn from the durations in the training split (`speaking.Dwell`), in an order of ours.
+where this is annotated; without annotated gaze the speaker looks at random and `Dyad.attention` is unknown. It is also
+unknown while no face is seen. Faces and microphones differ from dyad to dyad. If the listener's gaze was not annotated,
+looks are drawn from the durations in the training split (`speaking.Dwell`); their order is ours, not recorded.
 
 Stretches with nods, above all at the end of a phrase, and those in which the listener is addressed are drawn more often
-than they occur in the meetings; a set of enough minutes holds every stretch once.
+than they occur in the meetings; a set of enough minutes contains every stretch once.
 
-A listener's own words get a voice as well, one whose mouth was filmed, and the mouth that belongs to it. Two more sets
+A listener's own words also get a voice, one whose mouth was filmed, and the mouth that belongs to it. Two more sets
 serve models that speak: `interaction`, stretches in which the person talks a good share of the time, and `speaking`,
 the filmed recordings themselves (`speaking.py`). Each is a separate data set, in a folder of that name.
 """
@@ -71,21 +71,21 @@ SetName = Scene | Literal["speaking"]
 # Minutes of each set, per minute of listening.
 SHARES: Final[Mapping[SetName, float]] = {"listening": 1.0, "interaction": 0.5, "speaking": 0.25}
 _FILMED: Final = 0.4  # share of dyads with a voice whose mouth was recorded
-_FACELESS: Final = 0.25  # share of those in which the speaker is heard only
+_FACELESS: Final = 0.25  # share of dyads in which the speaker is heard but not seen
 _FLOOR_S: Final = 1.0  # a shorter phrase does not take the floor
-# Base + nods a minute, up to + a nod after a phrase, up to + addressed time.
+# Of a stretch: base, most for nods a minute, each nod after a phrase, most such nods, share of addressed time.
 _WEIGHTS: Final = (4.0, 3.0, 2.0, 3, 100.0)
 
-_FILES: Final = ("*_[A-Z]_[0-9][0-9][0-9][0-9].npz", speaking.FILES)  # Stretch.name
+_FILES: Final = ("*_[A-Z]_[0-9][0-9][0-9][0-9].npz", speaking.FILES)  # the first: by Stretch.name
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stretch:
-    """A piece of a meeting in which a person mostly listens.
+    """A piece of a meeting with one person as the listener.
 
     Attributes:
-        nods_per_minute: of listening time.
-        answers: nods that begin 0 to 0.8 s after the end of a phrase.
+        nods_per_minute: nods per minute of listening time.
+        answers: number of nods that begin 0 to 0.8 s after the end of a phrase.
         addressed: share of the time in which the person with the floor is known to look at the listener.
     """
 
@@ -98,8 +98,9 @@ class Stretch:
 
     @property
     def weight(self) -> float:
-        """Return how often the stretch is drawn: more for nods, for nods when a phrase ends, and for being
-        addressed.
+        """Return the weight of the stretch when stretches are drawn.
+
+        It grows with nods, with nods at the end of a phrase, and with the time in which the listener is addressed.
         """
         base, most, answer, answers, addressed = _WEIGHTS
         nods = min(self.nods_per_minute, most) + answer * min(self.answers, answers)
@@ -136,14 +137,15 @@ def compose_folder(
 ) -> dict[str, float]:
     """Compose from `data` (AMI tables in it or in its ami_listener_annotations/) into out/train, validation and test.
 
-    Two further sets of the same form go into out/interaction and out/speaking; without a filmed voice there is no
-    speaking.
+    Two further sets of the same form go into out/interaction and out/speaking; without a filmed voice, `speaking` is
+    empty.
 
-    Voices are the bundled speakers, those found in `data` (facegood_audio_mouth/, speech_audio/, conversation_audio/,
-    ami_audio_clips/, the clips beside the tables). Dyads of an earlier run are refused, or, with `overwrite`, removed
-    from `out` once the new ones are written: two sets never mix. `moved` is called after every dyad, with the
-    minutes written of its set and those wanted. `jobs`: processes; each part, a split of a set, has its own random
-    numbers, so the files are the same with any number. Returns the minutes written per split. Raises ConfigError.
+    Voices are the bundled speakers, unless `data` has a facegood_audio_mouth/, and those found in `data`
+    (facegood_audio_mouth/, speech_audio/, conversation_audio/, ami_audio_clips/, the clips in the folder of the
+    tables). Two sets never mix: if `out` holds dyads of an earlier run, ConfigError is raised, or, with `overwrite`,
+    they are removed once the new ones are written. `moved` is called after every dyad, with the minutes written of its
+    set and those wanted. `jobs`: number of processes. Each part, a split of a set, has its own random numbers, so the
+    files are the same with any number. Returns the minutes written per split. Raises ConfigError.
     """
     parts = [
         Part(name, split, (out if name == "listening" else out / name) / split, share * minutes)
@@ -204,7 +206,7 @@ def _whole_part(data: Path, part: Part, seed: int) -> list[tuple[Part, Path, flo
 
 @lru_cache(maxsize=1)
 def material_of(data: Path) -> dict[Split, Material]:
-    """Return the material by split, in a folder and bundled: AMI tables, voices, primitives. Raises ConfigError."""
+    """Return the material by split, of a folder and bundled: AMI tables, voices, primitives. Raises ConfigError."""
     ami = data / "ami_listener_annotations" if (data / "ami_listener_annotations").is_dir() else data
     brought = [folder for folder in (*(data / name for name in VOICE_FOLDERS), ami) if folder.is_dir()]
     bundled = [] if (data / "facegood_audio_mouth").is_dir() else [data_dir("sim") / "speakers"]
@@ -225,9 +227,9 @@ def _composed(parts: Sequence[Part]) -> set[Path]:
 
 
 def dyads(material: Mapping[Split, Material], name: SetName, split: Split, seed: int, minutes: float) -> Iterator[Dyad]:
-    """Yield the dyads of one split of a set, one by one: for sets that need not fit in memory.
+    """Yield the dyads of one split of a set, one by one, so that the set need not fit in memory.
 
-    `minutes`: of the training split. Without filmed voices, the set `speaking` has none. Raises ConfigError.
+    `minutes`: of the training split. Without filmed voices, the set `speaking` is empty. Raises ConfigError.
     """
     if not minutes > 0:
         raise ConfigError(f"--minutes {minutes:g}: must be above 0")
@@ -249,13 +251,13 @@ def cast(voices: Sequence[VoiceClip], rng: Rng) -> VoiceClip:
 
 
 def own_voice(voices: Sequence[VoiceClip], other: VoiceClip, rng: Rng) -> VoiceClip | None:
-    """Draw a filmed voice for the listener, if possible not the speaker's; None: none was filmed."""
+    """Draw a filmed voice for the listener, if possible not the speaker's; None if no voice was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     fitting = [voice for voice in filmed if voice.name != other.name] or filmed
     return pick(fitting, rng) if fitting else None
 
 
-# --- which stretches --------------------------------------------------------------------------------------------
+# --- choice of stretches ----------------------------------------------------------------------------------------
 
 
 def stretches(people: Sequence[MeetingPerson], rng: Rng, scene: Scene = "listening") -> list[Stretch]:
@@ -286,21 +288,21 @@ def stretches(people: Sequence[MeetingPerson], rng: Rng, scene: Scene = "listeni
 
 
 def choose(found: Sequence[Stretch], minutes: float, rng: Rng) -> list[Stretch]:
-    """Draw about `minutes` of stretches without repetition, by weight; all of them where there are no more.
+    """Draw about `minutes` of stretches without repetition, by weight; all of them if they last no longer.
 
-    Systematic draw along the nod rate: even a small set has the rates of the large one.
+    The draw is systematic along the nod rate, so that even a small set has the nod rates of the large one.
     """
     if not found:
         return []
     ranked = sorted(found, key=lambda stretch: stretch.nods_per_minute)
     weights = np.array([stretch.weight for stretch in ranked])
     lengths = np.array([stretch.frames * FRAME_S / 60 for stretch in ranked])
-    low, high = 0.0, 1 / weights.min()  # chances proportional to the weights, none above 1, for the length wanted
+    low, high = 0.0, 1 / weights.min()  # bounds of the factor of the weights; chances are at most 1
     for _ in range(50):
         middle = (low + high) / 2
         low, high = (middle, high) if (np.minimum(1, middle * weights) * lengths).sum() < minutes else (low, middle)
     chances = np.minimum(1, high * weights)
-    if chances.sum() < 1:  # less than one stretch is asked for
+    if chances.sum() < 1:  # less than one stretch is wanted
         chances = chances / chances.sum()
     spots = np.floor(np.cumsum(chances) + rng.random())
     drawn = np.flatnonzero(np.diff(spots, prepend=0.0) >= 1)
@@ -311,7 +313,7 @@ def choose(found: Sequence[Stretch], minutes: float, rng: Rng) -> list[Stretch]:
 
 
 def compose_one(stretch: Stretch, material: Material, rng: Rng) -> Dyad:
-    """Return one stretch as a dyad: cast, acted and voiced."""
+    """Return one stretch as a dyad: choose its voices, render its motion and its sound."""
     person, frames = stretch.person, stretch.frames
     voice = cast(material.voices, rng)
     others, own = active(person.others, stretch), active(person.talk, stretch)
@@ -380,7 +382,7 @@ def speaker_of(
 ) -> tuple[Floats, Floats]:
     """Return sound and face of the others: audio (N * 640,), face (N, 58), rows of NaN where no face is seen.
 
-    `smiles`: (K, 3) start, end [s] and size of theirs, besides those of laughs.
+    `smiles`: (K, 3) start, end [s] and size of the others' smiles, in addition to those of laughs.
     """
     person, frames = stretch.person, stretch.frames
     speech, mouth = _laid(person.others, stretch, voice, rng)
@@ -393,7 +395,7 @@ def speaker_of(
 
 
 def attention_of(stretch: Stretch) -> Floats:
-    """Return (N,) 1 where the person with the floor looks at the listener, 0 where not, NaN where it was not annotated.
+    """Return (N,) 1 where the person with the floor looks at the listener, 0 where not, NaN if not annotated.
 
     The floor belongs to the person who began the latest phrase of a second or more.
     """
@@ -411,12 +413,12 @@ def attention_of(stretch: Stretch) -> Floats:
 
 
 def spans_by(told: Sequence[LabelledSpan], agent: str | None = None) -> Doubles:
-    """Return spans (K, 2) of what one agent did, or all."""
+    """Return the spans (K, 2) of one agent, or of all agents."""
     return interval_table((a, b) for a, b, who in told if agent in (None, who))
 
 
 def active(spans: Doubles, stretch: Stretch) -> Bools:
-    """Return frames (N,) whose middle lies in a span."""
+    """Return a mask (N,) of the frames whose middle lies in a span."""
     out = np.zeros(stretch.frames, bool)
     for start, end in spans[(spans[:, 1] > stretch.start_s) & (spans[:, 0] < stretch.end_s)]:
         first, last = (int(np.ceil((t - stretch.start_s) * FRAME_HZ - 0.5)) for t in (start, end))
@@ -425,16 +427,16 @@ def active(spans: Doubles, stretch: Stretch) -> Bools:
 
 
 def within(spans: Doubles, stretch: Stretch) -> Doubles:
-    """Return spans that begin inside, in seconds of the stretch, with room to be seen before its end."""
+    """Return the spans that begin in the stretch, 0.5 s or more before its end, in seconds from its start."""
     inside = (spans[:, 0] >= stretch.start_s) & (spans[:, 0] < stretch.end_s - 0.5)
     return spans[inside] - stretch.start_s
 
 
-# --- A speaker as some microphone in some room and some face tracker would take them ------------------------------
+# --- A speaker as recorded by some microphone in some room and by some face tracker -------------------------------
 #
-# None of it is of the person: a listener that was taught with many learns to leave it alone.
+# These differences say nothing about the person: a listener trained on many of them learns to ignore them.
 
-_CLOSE: Final = 0.4  # share of microphones that hear no room
+_CLOSE: Final = 0.4  # share of microphones that record no reverberation
 _GAIN_DB: Final = (-14.0, 8.0)
 _TILT: Final = (-0.4, 0.5)
 _LOST: Final = 0.4  # share of trackers that lose a face now and then
@@ -443,7 +445,7 @@ _LOST_S: Final = (0.3, 3.0)
 
 
 def heard(speech: Floats, voice: VoiceClip, rng: Rng) -> Floats:
-    """Return speech (n,) with room, spectral tilt, gain and noise floor."""
+    """Return speech (n,) with reverberation, spectral tilt, gain and noise floor."""
     direct = speech if rng.random() < _CLOSE else reverberant(speech, rng)
     tilt = np.float32(rng.uniform(*_TILT))
     toned = direct - tilt * np.concatenate([[0], direct[:-1]]).astype(np.float32)
@@ -452,7 +454,7 @@ def heard(speech: Floats, voice: VoiceClip, rng: Rng) -> Floats:
 
 
 def seen(motion: Floats, rng: Rng) -> Floats:
-    """Return a face (N, 58) with a tracker's neutral, scale and noise; rows of NaN where it was lost."""
+    """Return a face (N, 58) with a tracker's offset, scale and noise; rows of NaN while it is lost."""
     frames = len(motion)
     out = motion.copy()
     stands = np.concatenate([np.deg2rad(rng.normal(0, 5, 3)), rng.normal(0, 0.05, 3)])

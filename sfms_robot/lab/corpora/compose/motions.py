@@ -57,9 +57,9 @@ def stretched(curve: Floats, frames: int) -> Floats:
 
 
 def held(curve: Floats, frames: int) -> Floats:
-    """Return a rise and fall (K, 52) that is seen (mouthSmile above half of its height) for about `frames` frames.
+    """Return a rise and fall (K, 52) that is seen (mouthSmile above half of its peak) for about `frames` frames.
 
-    Longer ones rest at their height, as long smiles do; shorter ones are played faster, to 0.6 of their length at most.
+    A longer one is held at its peak, as long smiles are; a shorter one is played faster, down to 0.6 of its length.
     """
     height = curve[:, SMILE].mean(axis=1)
     peak, seen = int(height.argmax()), int((height > 0.5 * height.max()).sum())
@@ -91,10 +91,10 @@ def laid_event(kind: str, start_s: float, curve: Floats, size: float) -> Listene
 
 
 def pick(items: Sequence[_Item], rng: Rng) -> _Item:
-    """Draw one, each as likely as any other."""
+    """Draw one item, all with the same probability."""
     return items[int(rng.integers(len(items)))]
 
 
 def over(below: Floats, above: Floats) -> Floats:
-    """Combine two activations of the same muscles: their sum while small, saturating at 1, smooth."""
+    """Combine two activations of the same muscles: about their sum while small, saturating smoothly at 1."""
     return below + above - np.clip(below, 0, 1) * np.clip(above, 0, 1)

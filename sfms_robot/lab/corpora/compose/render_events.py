@@ -1,8 +1,9 @@
-"""From a score of events to a listener's motion: recorded primitives, stretched and laid where things happened.
+"""A listener's motion from a score of events: recorded primitives, stretched and placed at the times of the events.
 
 Everything is added to a head and a face that never stand still. Layers are joined so that neither value nor speed
-jumps: primitives start and end at rest, looks go by `signals.gaze_kinematics`, loops are crossfaded. What was laid,
-when and how large, comes back as events. Nothing else of their kind is put there, but for what a head does that speaks.
+jumps: primitives start and end at rest, looks follow `signals.gaze_kinematics`, loops are crossfaded. The times and
+sizes of the placed primitives are returned as events. The motion has no others of their kind, except the movements of a
+head that speaks.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ from sfms_robot.signals import gaze_kinematics
 from sfms_robot.signals.events import runs
 from sfms_robot.signals.motion_primitives import Motions
 
-NOD_RAD_S2: Final = np.deg2rad(1600)  # necks of heads that will play this stay below 1800 deg/s^2
+NOD_RAD_S2: Final = np.deg2rad(1600)  # the heads that will play this limit their necks to 1800 deg/s^2
 _LIDS: Final = [SHAPE["eyeBlinkLeft"], SHAPE["eyeBlinkRight"]]
 _MIRROR: Final = [BLENDSHAPES.index(other_side(name)) for name in BLENDSHAPES]
 _TURNED: Final = [CHANNEL_INDEX[name] for name in LATERAL_POSE]
@@ -65,8 +66,8 @@ class Score(NamedTuple):
 
     Attributes:
         nods, shakes, tilts, laughs, talk, backchannels, mm_hms: the listener's own.
-        gaze: (start, end, where) of looks away from the speaker: "side A".."side E", "down", "screen" or "away". How
-            far and to which side follows `signals.event_sizes`: a robot does not sit at their table.
+        gaze: (start, end, where) of looks away from the speaker: "side A".."side E", "down", "screen" or "away". Angle
+            and side are drawn by `signals.event_sizes`, since a robot does not sit at their table.
         shared_laughs: laughs of the others.
         smiles: the listener's answers to others' smiles, (K, 3): start, end, size.
         asked, ends: instants at which the others asked something, and at which their phrases ended.
@@ -91,7 +92,7 @@ class Score(NamedTuple):
 
 @dataclass(frozen=True)
 class Acted:
-    """Motion (N, 58), the events that are in it by their start, and the part (N, 3) of its head that is gaze."""
+    """Motion (N, 58), its events sorted by start, and the part (N, 3) of its head's angles that belongs to the gaze."""
 
     motion: Floats
     events: tuple[ListenerEvent, ...]
@@ -99,7 +100,7 @@ class Acted:
 
 
 def act(score: Score, motions: Motions, rng: Rng) -> Acted:
-    """Return one listener, whose manners (size and pace of nods, blinks, places of looks) are drawn."""
+    """Return the motion of a listener whose habits (size and pace of nods, blinks, directions of looks) are drawn."""
     motion = np.zeros((score.frames, MOTION_DIM), np.float32)
     pose, shapes = motion[:, POSE], motion[:, SHAPES]  # views
     targets, looks = _targets(score, rng)
@@ -133,7 +134,7 @@ def speaker_motion(
 
     Args:
         smiles: (K, 3) start, end [s], size.
-        attention: (N,) 1 where they look at the listener, 0 where they do not, NaN where anything may be.
+        attention: (N,) 1 where they look at the listener, 0 where they do not, NaN where unknown.
         laughs, nods: (K, 2) seconds.
     """
     motion = np.zeros((len(mouth), MOTION_DIM), np.float32)
@@ -193,7 +194,7 @@ def _talking_head(score: Score, motions: Motions, rng: Rng) -> Floats:
 
 
 def nod_habit(rng: Rng) -> tuple[float, float]:
-    """Draw how a person nods: the usual size, about 5 degrees [rad, peak to peak], and 1.8 to 3 swings a second."""
+    """Draw a person's usual size of nods [rad, peak to peak], about 5 degrees, and their 1.8 to 3 swings a second."""
     usual = sizes.NOD_DEG[1]
     size = np.deg2rad(rng.normal(usual, usual * sizes.HABIT_SPREAD))
     return float(size), rng.uniform(*sizes.SWINGS_HZ)
@@ -202,7 +203,7 @@ def nod_habit(rng: Rng) -> tuple[float, float]:
 def nod_of(kind: str, start_s: float, length_s: float, habit: tuple[float, float], rng: Rng) -> ListenerEvent:
     """Return a nod of about this duration: 1 to 4 swings of 1.5 to 3.3 Hz, the first of 2.2 to 12 degrees.
 
-    `habit`: of `nod_habit`.
+    `habit`: from `nod_habit`.
     """
     usual_rad, pace_hz = habit
     swings, lasts_s = sizes.swings(length_s, pace_hz)
@@ -212,9 +213,9 @@ def nod_of(kind: str, start_s: float, length_s: float, habit: tuple[float, float
 
 
 def nod_curve(nod: ListenerEvent, fall: float, shape: Floats, frames: int) -> Floats:
-    """Return nose down [rad] (frames,) of a nod, smaller where a neck could not follow.
+    """Return the pitch [rad], nose down, (frames,) of a nod, with a smaller size if a neck could not follow.
 
-    `fall`: the size of each swing over that of the one before.
+    `fall`: size of each swing relative to the swing before.
     """
     out = np.zeros(frames)
     each_s = nod.duration_s / nod.swings
@@ -251,7 +252,7 @@ def _tilt(pose: Floats, spans: Doubles, rng: Rng) -> Events:
 
 
 def _bend(shape: Floats, length_s: float) -> float:
-    """Return the largest second derivative of a unit cycle over unit time, as seen at the frame rate."""
+    """Return the largest second derivative of a unit cycle over unit time, sampled at the frame rate."""
     samples = max(4, round(length_s * FRAME_HZ))
     played = np.interp(np.linspace(0, 1, samples + 1), np.linspace(0, 1, len(shape)), shape)
     twice = np.concatenate([[0, 0], np.tile(played[:-1], 2), [0, 0, 0]])
@@ -262,7 +263,7 @@ def _bend(shape: Floats, length_s: float) -> float:
 
 
 def _look(motion: Floats, targets: Floats, seed: int) -> Floats:
-    """Turn eyes and head of a motion (N, 58) to targets (N, 2); return what that adds to its head (N, 3)."""
+    """Turn eyes and head of a motion (N, 58) to targets (N, 2); return the angles added to the head (N, 3)."""
     head, eyes, _ = gaze_kinematics.follow(targets, motion[:, POSE], gaze_kinematics.start(seed))
     motion[:, POSE][:, :3] += head
     motion[:, list(gaze_kinematics.EYE_CHANNELS)] = eyes
@@ -276,14 +277,14 @@ def _targets(score: Score, rng: Rng) -> tuple[Floats, Events]:
     for start, end, where in score.gaze:
         far, side, up = rng.random(3).tolist()
         target = sizes.aside(sizes.aside_rad(far), side, up)
-        if where.startswith("side"):  # the same person sits where he sat
+        if where.startswith("side"):  # a person stays in the same seat
             target = seats.setdefault(where, target)
         out[max(0, first_frame(start)) : max(0, first_frame(end))] = target
     return out, _shifts(out)
 
 
 def _shifts(targets: Floats) -> Events:
-    """Return one event at each step of the targets (N, 2); before the first frame the listener looked at the person."""
+    """Return one event at each step of the targets (N, 2); before the first frame the listener looks at the person."""
     before = np.concatenate([np.zeros((1, 2), np.float32), targets])
     at = np.flatnonzero((np.diff(before, axis=0) != 0).any(axis=1)).tolist()
     return [
@@ -299,7 +300,7 @@ def _shifts(targets: Floats) -> Events:
 
 
 def _speaker_targets(attention: Floats, rng: Rng) -> Floats:
-    """Return where a speaker looks, (N, 2): at the listener or not as given, at random where not known."""
+    """Return gaze targets (N, 2) of a speaker: at the listener or not as `attention` says, at random where unknown."""
     at_listener = attention > 0.5
     unknown = np.isnan(attention)
     looks, row = rng.random() < 0.6, 0
@@ -327,10 +328,10 @@ def _idle(motions: Motions, frames: int, rng: Rng) -> Floats:
 
 
 def _smile(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> Events:
-    """Lay smiles: own laughs and returned smiles always, laughs of others often, backchannels and nods seldom.
+    """Add smiles: to own laughs and returned smiles always, to others' laughs often, to backchannels and nods seldom.
 
-    Only a laugh opens the jaw.
-    A smile that would begin during another one is left out.
+    A laugh opens the jaw by 0.7 of the recorded opening, other smiles by 0.1 or 0.2.
+    A smile that would begin during another smile is left out.
     """
     wanted = [
         ("laugh", a, b - a + rng.uniform(*sizes.LAUGH_LONGER_S), rng.uniform(*sizes.LAUGH), 0.7)
@@ -363,10 +364,10 @@ def lay_smile(
     motions: Motions,
     rng: Rng,
 ) -> Floats:
-    """Lay a recorded smile over the face (N, 52) from `start_s` on; return the curve (K, 52)."""
+    """Add a recorded smile to the face (N, 52) from `start_s` on; return its curve (K, 52)."""
     curve = held(pick(motions.smiles, rng), int(seen_s * FRAME_HZ))
     knots = np.arange(0, len(curve) + FRAME_HZ, FRAME_HZ)
-    breath = np.interp(np.arange(len(curve)), knots, rng.uniform(0.9, 1.0, len(knots)))  # no smile stands still
+    breath = np.interp(np.arange(len(curve)), knots, rng.uniform(0.9, 1.0, len(knots)))  # a smile never stands still
     curve = (size * curve * (breath * edges(len(curve), 9))[:, None]).astype(np.float32)
     curve[:, SHAPE["jawOpen"]] *= jaw
     np.copyto(shapes, over(shapes, placed(curve, start_s, len(shapes))))
@@ -390,9 +391,9 @@ def _raise_brows(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> Ev
 
 
 def _speak(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> Events:
-    """Lay the listener's own words: the mouth of the voice, or some recorded mouth over them, small for an "mm-hm".
+    """Add the mouth of the listener's own words: the voice's own, or else a recorded one, smaller for an "mm-hm".
 
-    The size of an "mm-hm" is how far it opens the jaw.
+    The size of an "mm-hm" event is its largest jaw opening.
     """
     said = np.zeros_like(shapes) if score.mouth is None else score.mouth
     source = motions.talk[0]
@@ -413,7 +414,7 @@ def _speak(shapes: Floats, score: Score, motions: Motions, rng: Rng) -> Events:
 
 
 def _blink(shapes: Floats, cues: Doubles, motions: Motions, rng: Rng) -> Events:
-    """Lay blinks at recorded intervals and a personal rate; half wait for a cue (gaze shift, phrase end) nearby."""
+    """Add blinks at recorded intervals and a personal rate; half of those near a gaze shift or phrase end are at it."""
     end_s = len(shapes) * FRAME_S
     pace, gaps = rng.uniform(0.75, 1.4), np.concatenate(motions.gaps)
     at, times = rng.uniform(0, 3), []

@@ -1,7 +1,7 @@
 """Dyads in which only the agent speaks: filmed recordings, voice and mouth together.
 
-Only here lips and sound are of one moment and one person throughout; the head and the rest of the face come from other
-recordings. Models learn from these dyads to follow `--agent-audio`, and are scored on them.
+Only in these dyads are lips and sound from the same moment and the same person throughout; the head and the rest of the
+face come from other recordings. Models learn from these dyads to follow `--agent-audio`, and are scored on them.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from sfms_robot.signals.motion_primitives import Motions
 
 LENGTH_S: Final = (15.0, 35.0)
 FILES: Final = "speaking_*_[0-9][0-9][0-9].npz"
-_QUIET: Final = 0.5  # share of dyads in which the other's microphone hears nothing at all, not even the room
+_QUIET: Final = 0.5  # share of dyads in which the other's microphone records zeros, not even room noise
 _GAIN_DB: Final = (-10.0, 6.0)
 
 
 def dyads(
     voices: Sequence[VoiceClip], motions: Motions, dwell: Dwell, seed: Sequence[int], minutes: float
 ) -> Iterator[Dyad]:
-    """Yield about `minutes` of pieces of the filmed voices; none where none was filmed."""
+    """Yield about `minutes` of pieces of the filmed voices; nothing if no voice was filmed."""
     filmed = [voice for voice in voices if voice.mouth is not None]
     weights = np.array([len(voice.recording) for voice in filmed], float)
     rng = np.random.default_rng(seed)
@@ -79,7 +79,7 @@ def take(name: str, voice: VoiceClip, motions: Motions, dwell: Dwell, rng: Rng) 
 
 
 def sent(speech: Floats, rng: Rng) -> Floats:
-    """Return speech as a program sends it to a loudspeaker: some level, and silence that is digital or nearly so."""
+    """Return speech as a program sends it to a loudspeaker: at a random level, its silence exactly or nearly zero."""
     gain = np.float32(10 ** (rng.uniform(*_GAIN_DB) / 20))
     hiss = rng.standard_normal(len(speech), np.float32) * np.float32(10 ** (rng.uniform(-90, -60) / 20))
     floor = hiss if rng.random() < 0.3 else np.float32(0)
@@ -88,14 +88,14 @@ def sent(speech: Floats, rng: Rng) -> Floats:
 
 # --- Where listeners look: annotated looks away from the person with the floor, and durations learned from them -----
 #
-# Across a table with papers people look away a lot more than in front of one face, and watch slides for minutes: a
-# share of the looks is kept, and none lasts longer than a look aside drawn for people without a table between them
-# (`signals.event_sizes`), which is what a listener's own events go by. Where gaze was not annotated, looks are drawn
-# from these kept ones: at the person and away in turns, each as long as some annotated one was. That they do not
-# depend on what is heard is ours.
+# At a table with papers people look away much more than in front of one face, and they watch slides for minutes. So
+# only a share of the looks is kept, and none lasts longer than a look aside drawn for people without a table between
+# them (`signals.event_sizes`), which also sets the lengths of a listener's own looks. If gaze was not annotated, looks
+# are drawn from the kept ones: at the person and away in turns, each as long as some annotated look. These do not
+# depend on the sound, which is our simplification.
 
 _KEPT: Final = 0.4
-_NEAR_S: Final = 300.0  # no look is longer
+_NEAR_S: Final = 300.0  # longer than any look
 _PLACES: Final = {"table": "down", "slide-screen": "screen", "whiteboard": "screen"}
 
 
@@ -107,7 +107,7 @@ class Dwell:
     away: tuple[tuple[float, str], ...]
 
     def looks(self, length_s: float, rng: Rng) -> LabelledSpans:
-        """Draw looks away in `length_s` seconds; none where nothing was learned."""
+        """Draw looks away within `length_s` seconds; none if no durations were learned."""
         found: list[LabelledSpan] = []
         if not self.at_s or not self.away:
             return ()
@@ -120,7 +120,7 @@ class Dwell:
 
 
 def learn_dwell(people: Sequence[MeetingPerson]) -> Dwell:
-    """Return the durations of all people with annotated gaze; empty where there are none."""
+    """Return the durations of all people with annotated gaze; empty if there are none."""
     rng = np.random.default_rng(0)
     at_s: list[float] = []
     elsewhere: list[tuple[float, str]] = []
@@ -143,7 +143,7 @@ def away(person: MeetingPerson, start_s: float, end_s: float, rng: Rng) -> list[
         if len(target) == 1 and target in floor:
             spoke = floor[target]
             if ((spoke[:, 0] < end + 1) & (spoke[:, 1] > start - 1)).any():
-                continue  # he speaks during the look, or is about to, or just has
+                continue  # the person looked at speaks during the look or less than 1 s before or after it
         if rng.random() < _KEPT:
             found.append((start, min(end, start + aside_s(rng.random())), where))
     return found

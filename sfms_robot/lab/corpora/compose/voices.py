@@ -1,7 +1,7 @@
-"""Recorded speech, cut at its pauses, to be laid on other people's talk.
+"""Recorded speech, cut at its pauses, that replaces the speech of people in a meeting.
 
-A talk segment of the meeting is filled with the speech that *ends* at a phrase end of the recording, so that the fall
-of the voice at the end of a phrase falls where the meeting's phrase ended; earlier phrases fill up the beginning.
+A talk segment of the meeting is filled with speech that *ends* at a phrase end of the recording, so that the fall of
+the voice at the end of a phrase comes where the meeting's phrase ended; earlier phrases fill the beginning.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ VOICE_FOLDERS: Final = (
     "ami_audio_clips",
 )  # of a data folder
 _SOUNDS: Final = (".wav", ".flac")
-# Two people in one track, hardly audible, hardly any speech, or people talking over one another.
+# Not used: two people in one track, hardly audible, hardly any speech, or people talking over one another.
 _UNFIT: Final = (
     "katiesteve", "audio_ES2003a", "audio_EN2001b", "audio_EN2001d", "audio_EN2002", "audio_EN2009b", "pair_",
 )  # fmt: skip
-_LAUGH_S: Final = 0.4  # shorter ones are a puff of breath
-_GRAIN: Final = AUDIO_HZ // 50  # 20 ms: pauses are cut out down to this
-_PHRASE: Final = AUDIO_HZ // 5  # a pause this long ended a phrase
-_JOIN: Final = AUDIO_HZ // 200  # 5 ms where two phrases meet
+_LAUGH_S: Final = 0.4  # shorter laughs are only a puff of breath
+_GRAIN: Final = AUDIO_HZ // 50  # 20 ms, the resolution at which pauses are cut out
+_PHRASE: Final = AUDIO_HZ // 5  # a pause of this length ends a phrase
+_JOIN: Final = AUDIO_HZ // 200  # 5 ms, fade where two pieces are joined
 _FADE: Final = AUDIO_HZ // 50
 _LEVEL: Final = 0.06  # RMS of speech
 
@@ -55,7 +55,7 @@ class VoiceClip:
         origin: (n // 320,) sample of the recording at every 320th sample of `audio`.
         ends: (P,) samples of `audio` at which a phrase ends.
         mouth: (F, 52) by frame of the recording, or None.
-        noise: (m,) magnitude spectrum of its pauses, flat where it has none.
+        noise: (m,) magnitude spectrum of its pauses; flat if they are too short or silent.
         recording: (r,) 16 kHz, the whole recording, RMS of its speech 0.06.
     """
 
@@ -78,7 +78,7 @@ def find_voices(folders: Sequence[Path]) -> list[VoiceClip]:
 
 
 def split_voices(voices: Sequence[VoiceClip]) -> dict[Split, list[VoiceClip]]:
-    """Return whole recordings by split (`VOICES`); a split without any gets all of them."""
+    """Return whole recordings by split (`clips.VOICES`); a split without any recording gets all of them."""
     parts = by_split((split_of_voice(voice.name), voice) for voice in voices)
     return {split: parts[split] or list(voices) for split in SPLITS}
 
@@ -86,8 +86,8 @@ def split_voices(voices: Sequence[VoiceClip]) -> dict[Split, list[VoiceClip]]:
 def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
     """Return annotated laughs without speech over them, (n,) 16 kHz each, by split; may be empty.
 
-    Looks for a table words.csv.gz (clip, start_s, end_s, kind, text) beside the clips. Raises ConfigError when one of
-    them is broken.
+    Reads the table words.csv.gz (clip, start_s, end_s, kind, text) in the folder of the clips, if there is one. Raises
+    ConfigError for a broken table or clip.
     """
     found: list[tuple[Split, Floats]] = []
     for folder in folders:
@@ -106,7 +106,7 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
 
 
 def laugh(speech: Floats, spans_s: Doubles, laughter: Sequence[Floats], rng: Rng) -> Floats:
-    """Return speech (n,) with laughs in the spans (K, 2), or unchanged where no laughter is at hand."""
+    """Return speech (n,) with laughs in the spans (K, 2), or unchanged if `laughter` is empty."""
     out = speech.copy()
     for start_s, end_s in spans_s if laughter else ():
         at, end = (int(np.clip(t * AUDIO_HZ, 0, len(out))) for t in (start_s, end_s))
@@ -118,7 +118,7 @@ def laugh(speech: Floats, spans_s: Doubles, laughter: Sequence[Floats], rng: Rng
 
 
 def _eased(sound: Floats, longest: int = _FADE) -> Floats:
-    """Return sound (n,) that fades in and out over `longest` samples, or over half of it."""
+    """Return sound (n,) that fades in and out over `longest` samples, or over half its length if it is short."""
     ramp = np.ones(len(sound), np.float32)
     fade = min(longest, len(sound) // 2)
     ramp[:fade] = np.linspace(0, 1, fade)
@@ -127,12 +127,10 @@ def _eased(sound: Floats, longest: int = _FADE) -> Floats:
 
 
 def read_voice(file: Path) -> VoiceClip:
-    """Read a WAV file, and the mouth recorded with it (FACEGOOD weights, NAME.npz, or a face track) where there is
-    one.
-    """
+    """Read a sound file, and the mouth recorded with it, if any (FACEGOOD weights, NAME.npz, or a face track)."""
     audio = read_audio(file)
     active = voice_activity(audio, _GRAIN / AUDIO_HZ)
-    active = np.convolve(active, [1, 1, 1], "same") > 0  # a grain of margin: soft beginnings and endings
+    active = np.convolve(active, [1, 1, 1], "same") > 0  # one grain of margin keeps soft beginnings and endings
     speech = [(a * _GRAIN, b * _GRAIN) for a, b in runs(active) if b - a >= 5]
     if not speech:
         raise ConfigError(f"{file}: no speech found in it")
@@ -170,7 +168,7 @@ def _levelled(speech: Floats) -> Floats:
 
 
 def _lulls(speech: Floats) -> Bools:
-    """Return grains (n // 320,) inside pauses that only show once loudness is levelled, less 40 ms at each end."""
+    """Return a mask (n // 320,) of pauses that appear only after levelling, without 40 ms at each of their ends."""
     out = ~voice_activity(speech, _GRAIN / AUDIO_HZ)
     for start, end in runs(out):
         out[start : start + 2] = out[max(start, end - 2) : end] = False
@@ -188,8 +186,8 @@ def _mouth(file: Path) -> Floats | None:
     return None
 
 
-# ARKit channels of FACEGOOD's mouth controls, each with its weight: mouth_oh_c reaches 1 in ordinary speech. Where
-# several controls feed a channel the largest counts.
+# FACEGOOD's mouth controls and their weights, by ARKit channel. mouth_oh_c has half the weight because it reaches 1 in
+# ordinary speech. If several controls drive a channel, the largest counts.
 FACEGOOD: Final = {
     "jawOpen": (("mouth_stretch_c", 1.0),),
     "jawLeft": (("jaw_sideways_l", 1.0),),
@@ -239,7 +237,7 @@ def _pause_spectrum(audio: Floats, active: Bools) -> Doubles:
 
 
 def lay(segments_s: Doubles, frames: int, voice: VoiceClip, rng: Rng) -> tuple[Floats, Floats | None]:
-    """Fill talk segments (K, 2), seconds from 0, with a voice: audio (frames * 640,), mouth (frames, 52) or None."""
+    """Fill talk segments (K, 2) [s] with a voice; return audio (frames * 640,), and mouth (frames, 52) or None."""
     audio = np.zeros(frames * FRAME_SAMPLES, np.float32)
     mouth = None if voice.mouth is None else np.zeros((frames, len(SHAPE)), np.float32)
     last = rng.integers(len(voice.ends))
@@ -247,12 +245,12 @@ def lay(segments_s: Doubles, frames: int, voice: VoiceClip, rng: Rng) -> tuple[F
         start, end = (int(np.clip(round(t * AUDIO_HZ), 0, len(audio))) for t in (start_s, end_s))
         if end - start < 2 * _FADE:
             continue
-        # Recordings go on where they were, a phrase or two further: the same words do not come at once again.
+        # Continue one to three phrases further in the recording, so that the same words are not repeated at once.
         last = (last + rng.integers(1, 4)) % len(voice.ends)
         index = np.arange(voice.ends[last] - (end - start), voice.ends[last]) % len(voice.audio)
         audio[start:end] = _eased(voice.audio[index] * np.float32(rng.uniform(0.8, 1.25)))
         if mouth is not None and voice.mouth is not None:
-            covered = np.arange(start // FRAME_SAMPLES, end // FRAME_SAMPLES)  # frames that end inside
+            covered = np.arange(start // FRAME_SAMPLES, end // FRAME_SAMPLES)  # frames that end inside the segment
             spoken = index[(covered + 1) * FRAME_SAMPLES - 1 - start] // _GRAIN
             rows = np.minimum(voice.origin[spoken] // FRAME_SAMPLES + 1, len(voice.mouth) - 1)
             mouth[covered] = voice.mouth[rows]
@@ -260,13 +258,13 @@ def lay(segments_s: Doubles, frames: int, voice: VoiceClip, rng: Rng) -> tuple[F
 
 
 def _soften(mouth: Floats) -> Floats:
-    """Smooth shortly (binomial): joints lose their edges, syllables stay."""
+    """Smooth over three frames (binomial): joins lose their edges, syllables stay."""
     padded = np.pad(mouth, ((1, 1), (0, 0)), mode="edge")
     return np.asarray(0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:], np.float32)
 
 
 def room(samples: int, voice: VoiceClip, rng: Rng) -> Floats:
-    """Return a noise floor with the colour of the recording's own pauses, -70 to -48 dB of full scale, that drifts."""
+    """Return a noise floor with the spectrum of the recording's pauses, drifting, at -70 to -48 dB of full scale."""
     flat = rng.standard_normal(samples, np.float32)
     kernel = np.fft.irfft(voice.noise).astype(np.float32)
     kernel = np.roll(kernel, len(kernel) // 2) * np.hanning(len(kernel)).astype(np.float32)
@@ -287,9 +285,9 @@ def reverberant(speech: Floats, rng: Rng) -> Floats:
 
 
 def mouth_over(speech: Floats, talk: Sequence[Floats], frames: int, rng: Rng) -> Floats:
-    """Return a mouth (frames, 52) for a voice that was not filmed: a recorded one that opens when this one sounds.
+    """Return a mouth (frames, 52) for a voice that was not filmed: a recorded mouth that opens when the voice sounds.
 
-    It fits the words no better than any other mouth would; only when it moves, and how much, is of this voice.
+    It fits the words no better than any other mouth; only the time and size of its movements come from this voice.
     """
     source = pick(talk, rng)
     piece = np.roll(source, rng.integers(len(source)), axis=0)[np.arange(frames) % len(source)]

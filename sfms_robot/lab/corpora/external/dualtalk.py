@@ -96,7 +96,7 @@ ARKIT: Final = Faces(".npy", "arkit58", _arkit_shape, _arkit_rows)
 
 
 def splits(place: Path) -> Mapping[str, str]:
-    """Return splits with FLAME's faces; the folder of the demo itself is one."""
+    """Return the splits with FLAME's faces; the demo's own folder is also one."""
     demo = FLAME.people(place) and any(place.glob("*_speaker[12].wav"))
     return {split: split for split in (*SPLITS, DEMO) if FLAME.people(place / split)} or ({DEMO: "."} if demo else {})
 

@@ -2,9 +2,9 @@
 
 `{subject}/{train,test}/p{0,1}_{list,speak}_{faces,audio,files}_clean_deca.npy`, p0 the left person. The listener
 `p{o}_list_*` goes with the speaker `p{1-o}_speak_*`; o is 0 except for fallon. Faces are 50 expression | 3 head |
-3 jaw | 128 detail; sound is four mel rows a frame. Files are mapped, a clip is read when asked for.
+3 jaw | 128 detail; sound is four mel rows a frame. Files are memory-mapped; a clip is read when accessed.
 
-Deviations: sound is handed on as natural log of power, whatever the file holds, so that one unit serves all data. The
+Deviations: sound is returned as the natural log of power, whatever unit the file has, so that all data share one. The
 reference splits 70/30 at random without a seed; here the share held out is the same every time.
 
 lm-listener (Ng et al., ICCV 2023; sanjayss34/lm-listener @ 53ce4ecc): segments of any length at 30 fps, EMOCA.
@@ -45,7 +45,7 @@ from sfms_robot.signals.mel import FLOOR, LN_PER_DB, MEL_BINS, ROWS_PER_FRAME
 FPS: Final = 30.0
 SPACE: Final = "deca56"
 WIDTH: Final = 56
-UNUSED: Final = "devi2"  # there, and never used by the reference
+UNUSED: Final = "devi2"  # in the data, but not used by the reference
 HOST_IS_P1: Final = ("fallon",)
 STD_EPS: Final = 1e-10
 
@@ -55,7 +55,7 @@ def _is_subject(folder: Path) -> bool:
 
 
 def _subjects(place: Path) -> list[Path]:
-    """Return all folders of a place that holds subjects, or the one subject that it is; [] elsewhere."""
+    """Return `place` if it is a subject, or else all folders in it if one of them is a subject; else []."""
     found = [place] if _is_subject(place) else sorted(sub for sub in place.glob("*") if sub.is_dir())
     return found if any(map(_is_subject, found)) else []
 
@@ -72,7 +72,7 @@ def scan(place: Path, split: str) -> Iterator[Found]:
 
 
 def _direction(subject: str, folder: Path) -> Iterator[Found]:
-    """Yield the clips of one subject, listened to by the host."""
+    """Yield the clips of one subject in which the host listens."""
 
     def file(person: int, role: str, kind: str) -> Path:
         return folder / f"p{person}_{role}_{kind}_clean_deca.npy"
@@ -116,10 +116,10 @@ def _direction(subject: str, folder: Path) -> Iterator[Found]:
 
 
 def l2l_mean_std(x: ArrayLike) -> tuple[Doubles, Doubles]:
-    """Return mean and "std" (1, 1, D) of clips (N, T, D) with which L2L standardises.
+    """Return the mean and "std" (1, 1, D) of clips (N, T, D) that L2L standardises with.
 
-    The std is that over clips of the stds over time, which makes standardised errors several times larger than one
-    would think.
+    This "std" is the std over clips of the stds over time, which makes standardised errors several times larger than
+    with the usual std.
     """
     clips = np.asarray(x, dtype=np.float64)
     if clips.ndim != 3:
@@ -144,7 +144,7 @@ PEOPLE: Final = ("p1", "p0")  # speaker, listener
 
 
 def _segments(place: Path, split: str) -> list[Path]:
-    """Return the files of a split; a folder that joins others (trevorconanstephen) gives way to those."""
+    """Return the files of a split, without those of a folder that joins other folders (trevorconanstephen)."""
     name = f"segments_{split}.pth"
     if next(place.glob("segments_*.pth"), None):
         return [file for file in [place / name] if file.is_file()]

@@ -2,16 +2,16 @@
 
 `{train,val,test}.csv` list (speaker, listener) as `site/chat/person/clip`; below `{split}/` lie `3D_FV_files/*.npy`
 (751 FaceVerse frames of 58), `Audio_files/*.wav` (44.1 kHz) and `Emotion/*.csv` (25 attributes a frame), one file per
-clip. Metrics use 750 frames. Every pair is read both ways: val and test as the reference doubles them, so that a
-clip's `row` is its row in the appropriateness matrix; train because swapping by chance comes to the same.
+clip. Metrics use 750 frames. Every pair is read in both directions: val and test as the reference doubles them, so that
+a clip's `row` is its row in the appropriateness matrix; train because swapping roles at random is equivalent.
 
 REACT 2025 and 2026 (MARS): sessions of any length at 30 fps,
 `{train,val,test}/{coefficients,facial-attributes,audio,audio-features}/{speaker,listener}/session{n}/NAME`, the two
-people of a dyad under one name. Roles are given, so pairs are read one way. All listeners of a session count as
-appropriate.
+people of a dyad under one name. Roles are given, so pairs are read in one direction. All listeners of a session count
+as appropriate.
 
-Deviation: the references subtract a mean face or standardise on loading. Here motion stays as the files hold it, which
-is what the retargeting of `faceverse58` reads.
+Deviation: the references subtract a mean face or standardise on loading. Here motion is kept as in the files, which
+the retargeting of `faceverse58` expects.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _pairs(file: Path) -> list[tuple[str, str]]:
 
 
 def attributes(folder: Path, clip: str, frames: int) -> Floats:
-    """Return (frames, 25) of one clip, as the challenge labels it. Raises ClipError."""
+    """Return the attributes (frames, 25) of one clip, as labelled by the challenge. Raises ClipError."""
     cleaned = "/".join(CLEANED.get(part, part) for part in clip.split("/"))
     files = [folder / EMOTIONS / f"{name}.csv" for name in (clip, cleaned)]
     file = next((file for file in files if file.is_file()), files[0])
@@ -136,7 +136,7 @@ def attributes(folder: Path, clip: str, frames: int) -> Floats:
 
 
 def _feature(file: Path, frames: int, width: int) -> Floats:
-    """Return (frames, width); the last row again where a feature ends a frame or two early. Raises ClipError."""
+    """Return (frames, width), with the last row repeated if a feature ends up to two frames early. Raises ClipError."""
     values = npy(existing(file, "missing feature"))
     had = min(frames, frames_of(str(file), values.shape, (frames, width)))
     return np.pad(track(str(file), values, had, width), ((0, frames - had), (0, 0)), mode="edge")

@@ -1,15 +1,15 @@
 """Seamless Interaction (Agrawal et al. 2025; facebookresearch/seamless_interaction @ acc817c): two people face to face.
 
-`{improvised,naturalistic}/{train,dev,test}/BATCH/ARCHIVE/V.._S.._I.._P...{wav,json,npz}`, one of each a person;
+`{improvised,naturalistic}/{train,dev,test}/BATCH/ARCHIVE/V.._S.._I.._P...{wav,json,npz}`, one of each per person;
 partners share vendor, session and interaction, and each listens to the other. `.wav` is the own voice at 48 kHz;
 `.json` has `metadata:vad`, the spans of speech; `.npz` has rows at 30 Hz, of which three are read:
-`alignment_head_rotation` (T, 3), `FAUValue` (T, 24) and `is_valid` (T, 1), under `movement_v4:` where that is there,
+`alignment_head_rotation` (T, 3), `FAUValue` (T, 24) and `is_valid` (T, 1), under `movement_v4:` if that exists,
 else under `movement:`.
 
 Invalid frames are filled with zeros, in blocks of 2 s. A listener's clip ends where they begin; a speaker's face is
-unknown there. Rotation is taken as axis-angle in FLAME's axes (`_signs` compares that with the key points), relative to
-the head at rest: its median over the whole interaction, where a person mostly looks, which is the partner. Gaze,
-expression and head codes are outputs of a network and are not read, nor is the translation, whose unit is not
+unknown there. Rotation is read as axis-angle in FLAME's axes (`_signs` compares that with the key points), relative to
+the head at rest, which is the median over the whole interaction: a person mostly looks at the partner. Gaze, expression
+and head codes are outputs of a network and are not read. The translation is not read either, since its unit is not
 documented.
 """
 
@@ -52,32 +52,32 @@ LICENCE: Final = (
 )
 FPS: Final = 30.0
 SPACE: Final = "seamless27"  # rotation 3 | action units 24
-PREFIXES: Final = ("movement_v4", "movement")  # the newer first: it replaces the other
+PREFIXES: Final = ("movement_v4", "movement")  # the newer first, which replaces the other
 ROTATION, UNITS, VALID = "alignment_head_rotation", "FAUValue", "is_valid"
 KEYS: Final[Mapping[str, int]] = {ROTATION: 3, UNITS: len(FAU_VALUE), VALID: 1}
 KEYPOINTS: Final = "boxes_and_keypoints:keypoints"
 FILES: Final = (".npz", ".json", ".wav")
 VAD: Final = "metadata:vad"
 LEAST_FRAMES: Final = 60  # shorter stretches between invalid blocks are left out
-EDGE_FRAMES: Final = 2  # zeros have been seen so far on the valid side of a block
-SLACK_S: Final = 0.5  # by which the ends of sound, face, annotation and partner may differ
-LARGEST_LAG_S: Final = 0.25  # between a voice and what is annotated of it
-_LAGS_S: Final = 2.0  # looked for
-_LAG_GAIN: Final = 0.15  # by which another lag has to agree better
+EDGE_FRAMES: Final = 2  # zeros were found up to this far on the valid side of a block
+SLACK_S: Final = 0.5  # largest difference between the ends of sound, face, annotation and partner
+LARGEST_LAG_S: Final = 0.25  # between a voice and its annotation
+_LAGS_S: Final = 2.0  # largest lag that is tried
+_LAG_GAIN: Final = 0.15  # share of frames by which another lag must agree better than lag 0
 _ID: Final = re.compile(r"(V\w+_S\w+_I\w+)_P\w+")
 
 
-# --- what is there ----------------------------------------------------------------------------------------------
+# --- files ------------------------------------------------------------------------------------------------------
 
 
 def _archives(place: Path, split: str, pattern: str) -> list[Path]:
-    """Return what matches below the batches of a split, of both labels; `place` may be the folder of one label."""
+    """Return the files of a split that match `pattern`, of both labels; `place` may be the folder of one label."""
     bases = [place / label for label in LABELS] if place.name not in LABELS else [place]
     return [file for base in bases for file in sorted((base / split).glob(pattern))]
 
 
 def _files(place: Path, split: str) -> dict[str, dict[str, Path]]:
-    """Return the files of every person by their ending, by the person's id."""
+    """Return the files of every person, by the person's id and then by ending."""
     found: dict[str, dict[str, Path]] = defaultdict(dict)
     for file in _archives(place, split, "*/*/V*_S*_I*_P*.*"):
         if _ID.fullmatch(file.stem):
@@ -121,7 +121,7 @@ class SeamlessPerson:
     """One person's part of an interaction, from headers and flags.
 
     Attributes:
-        prefix: Of the person's rows in the .npz.
+        prefix: Prefix of the keys in the .npz.
         valid: (T,) frames whose rows hold a face.
         speaks: (T,) frames that are annotated as speech.
     """
@@ -137,7 +137,7 @@ class SeamlessPerson:
 def _clips(
     interaction: str, people: Sequence[tuple[str, Mapping[str, Path]]], mirrored: bool, seen: Counter[str]
 ) -> Iterator[Clip]:
-    """Yield both directions: every stretch in which the listener's face is valid."""
+    """Yield the clips of both directions: every stretch in which the listener's face is valid."""
     if len(people) != 2:
         problem = "the partner's files are not here" if len(people) == 1 else f"{len(people)} people, not two"
         raise ClipError("missing half", interaction, f"{problem}: {', '.join(name for name, _ in people)}")
@@ -152,13 +152,13 @@ def _clips(
 
 
 def stretches(valid: Bools) -> list[tuple[int, int]]:
-    """Return half-open [first, end) of frames to learn from: valid, off the edges of invalid blocks, long enough."""
+    """Return ranges [first, end) of frames to learn from: valid, away from edges of invalid blocks, long enough."""
     cut = [(first + EDGE_FRAMES * (first > 0), end - EDGE_FRAMES * (end < len(valid))) for first, end in runs(valid)]
     return [(first, end) for first, end in cut if end - first >= LEAST_FRAMES]
 
 
 def _person(name: str, files: Mapping[str, Path]) -> SeamlessPerson:
-    """Return a person. Raises ClipError for a file that is missing, and for ends that do not fit together."""
+    """Return a person. Raises ClipError for a missing file, and for lengths that do not fit together."""
     for ending in FILES:
         if ending not in files:
             missing = next(iter(files.values())).with_suffix(ending)
@@ -262,7 +262,7 @@ def _motion(person: SeamlessPerson, mirrored: bool) -> Floats:
 
 
 def _lag_s(active: Bools, voice: Floats) -> float:
-    """Return the delay of a voice after its annotation, (N,) at 30 Hz; 0 where it is not known."""
+    """Return the delay [s] of a voice after its annotation (N,) at 30 Hz; 0 if it cannot be determined."""
     heard = voice_activity(voice, 1 / FPS)
     noted = np.pad(active, (0, max(0, len(heard) - len(active))))[: len(heard)]
     reach = int(_LAGS_S * FPS)
@@ -277,29 +277,29 @@ def _lag_s(active: Bools, voice: Floats) -> float:
     return best / FPS if agreement(best) > agreement(0) + _LAG_GAIN else 0.0
 
 
-# --- Which way the numbers point, from the key points of the same frames ------------------------------------------
+# --- Signs of rotations and action units, checked with the key points of the same frames --------------------------
 #
-# Nobody has published the axes of `alignment_head_rotation`, nor the order of `FAUValue`. But the files also hold where
+# The axes of `alignment_head_rotation` and the order of `FAUValue` are not published. But the files also hold where
 # eyes, nose and lips were seen in the picture (`boxes_and_keypoints:keypoints`, COCO-WholeBody: Jin et al., ECCV 2020),
-# and these must go along: the nose goes down when the head does, to the picture's right when it turns to its own left,
-# the right eye falls below the left one when the right ear does, lips part when the jaw drops, lids meet when eyes
-# close.
+# and these must move accordingly: the nose goes down when the head does, and to the picture's right when the head turns
+# to its own left, the right eye falls below the left one when the right ear does, lips part when the jaw drops, lids
+# meet when eyes close.
 
 SIGNS: Final = ("pitch", "yaw", "roll", "jaw drop", "eyes closed")
 CLEAR: Final = 0.3  # correlations nearer to 0 prove nothing
-_SAMPLE: Final = 8  # people whose key points are looked at
-_SURE: Final = 0.3  # confidence of a key point
+_SAMPLE: Final = 8  # number of people whose key points are used
+_SURE: Final = 0.3  # least confidence of a key point that is used
 _NOSE, _LEFT_EYE, _RIGHT_EYE = 0, 1, 2
 _FACE: Final = 23  # the first of 68 landmarks of the face
 _LIPS: Final = (_FACE + 62, _FACE + 66)  # inner lip, upper and lower
-_LIDS: Final = np.array([(37, 41), (38, 40), (43, 47), (44, 46)]) + _FACE  # above, below
+_LIDS: Final = np.array([(37, 41), (38, 40), (43, 47), (44, 46)]) + _FACE  # upper and lower point
 _USED: Final = [_NOSE, _LEFT_EYE, _RIGHT_EYE, *_LIPS, *_LIDS.ravel()]
 
 
 def _signs(place: Path) -> tuple[bool, str]:
-    """Return whether yaw and roll both go against the picture (a frame with y down and z away), and a line about it.
+    """Return whether yaw and roll are both opposite to the picture (y down, z away), and a line of text about it.
 
-    From a sample over all splits, so that every split is read the same way; the figures are medians over files.
+    It uses a sample over all splits, so that every split is read the same way; the figures are medians over files.
     """
     files = [one[".npz"] for split in splits(place).values() for one in _files(place, split).values() if ".npz" in one]
     spread = np.unique(np.linspace(0, len(files) - 1, _SAMPLE).astype(int)).tolist() if files else []
@@ -307,7 +307,7 @@ def _signs(place: Path) -> tuple[bool, str]:
     for file in (files[index] for index in spread):
         try:
             found.append(guarded(file, partial(_correlations, file)))
-        except ClipError:  # named by the scan
+        except ClipError:  # listed by the scan
             continue
     found = [one for one in found if one]
     medians = {name: [one[name] for one in found if name in one] for name in SIGNS}

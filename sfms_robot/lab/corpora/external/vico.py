@@ -4,9 +4,9 @@
 `video_speaker` and `video_listener` (T, 56), pose first; `RLD_data.csv` lists ids (second column) and splits (last).
 `vico` (dc3ea9f/vico_challenge_baseline @ 16424c07): `features/audio_feats/<uuid>.npy` (T, 45),
 `features/video_feats/<uuid>.{speaker,listener}.bin`, torch-saved dicts with `angle.exp.trans` (T, 73) of
-Deep3DFaceRecon, which drives no head here. `metadata/data.csv` lists the uuids.
+Deep3DFaceRecon, which cannot drive a head here. `metadata/data.csv` lists the uuids.
 
-A pickle cannot be read in parts: each file is read once for its length, and again when asked for.
+A pickle cannot be read in parts: each file is read once for its length, and again when its clip is accessed.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def _rows(file: Path, load: Callable[[Path], Any], key: str) -> NDArray[Any]:
 
 
 def _frames(name: str, space: str, *tracks: tuple[Path, str, NDArray[Any]]) -> int:
-    """Return the frames of tracks, each with its file and key. Raises ClipError for another width."""
+    """Return the number of frames of tracks, given with file and key. Raises ClipError for another width."""
     for file, key, rows in tracks:
         if rows.ndim < 2 or rows.shape[-1] != WIDTHS[space]:
             raise ClipError("wrong dims", file, f"{key} has shape {rows.shape}, expected (T, {WIDTHS[space]})")
@@ -73,7 +73,7 @@ def _list_file(place: Path) -> Path | None:
 
 
 def _listed(place: Path) -> dict[str, str]:
-    """Return the split of every id; without the list all are train. Raises ConfigError for an invalid list."""
+    """Return the split of every id; without a list all are train. Raises ConfigError for an invalid list."""
     ids = sorted(file.stem for file in place.glob("*.pkl"))
     file = _list_file(place)
     if file is None or not ids:
@@ -122,7 +122,7 @@ _VECTORS: Final = "angle.exp.trans"
 
 
 def _uuids(place: Path) -> dict[str, str]:
-    """Return the split of every uuid; those without one are train. Raises ConfigError for an invalid list."""
+    """Return the split of every uuid; those without a split are train. Raises ConfigError for an invalid list."""
     videos, file = place / "features" / "video_feats", place / "metadata" / "data.csv"
     if not videos.is_dir() or not file.is_file():
         return dict.fromkeys(sorted({path.name.split(".")[0] for path in videos.glob("*.*.bin")}), "train")

@@ -44,24 +44,24 @@ from sfms_robot.signals.events import runs
 from sfms_robot.signals.voice_activity import levels_db
 
 SCENES: Final = ("speaking", "listening", "interaction")
-LEAST_STEP: Final = 0.01  # of a frame, in deviations of the motion
-LEAST_SPREAD: Final = 0.25  # of companded innovations: what hardly moves does not weigh more than what moves
-COMPANDED: Final = 4  # innovations above the deviation over this are companded: between what rests and what happens
-LARGEST_RHO: Final = 0.98  # of one frame to the next: what was drawn wrongly is forgotten within 2 s
-AT_REST: Final = 0.99  # of the frames in which nothing moves a face: beyond, it is on its way back
-LEAST_REST: Final = 10 * FRAME_HZ  # frames that tell how a face rests
-PAUSE_FRAMES: Final = FRAME_HZ // 2  # to either side of a word
-RARE: Final = 0.02  # of the frames with the same voices: a state so rare there is a label's edge
+LEAST_STEP: Final = 0.01  # from frame to frame, in deviations of the motion
+LEAST_SPREAD: Final = 0.25  # of companded innovations: channels that hardly move do not weigh more than others
+COMPANDED: Final = 4  # innovations above the deviation over this are companded: between rest and movement
+LARGEST_RHO: Final = 0.98  # from one frame to the next: errors in what was drawn are forgotten within 2 s
+AT_REST: Final = 0.99  # quantile of the distance of faces at rest; beyond it a face is returning to rest
+LEAST_REST: Final = 10 * FRAME_HZ  # frames at rest that are needed to measure this distance
+PAUSE_FRAMES: Final = FRAME_HZ // 2  # before and after a word that do not count as rest
+RARE: Final = 0.02  # share of the frames with the same voices; a rarer state is only the edge of a label
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LabelledDyad(ArigDyad):
-    """Inputs of the model, sound in half precision while it is kept, and states (..., N) int64, -1 unlabelled.
+    """Inputs of the model, with sound stored in half precision, and states (..., N) int64, -1 if unlabelled.
 
-    `control` is (..., N, 0) for a listener without events. `sway` (..., N, S) is the agent's slow motion, where that is
-    not in `agent_motion`; S = 0 without.
+    `control` is (..., N, 0) for a listener without events. `sway` (..., N, S) is the agent's slow motion, if that is
+    not in `agent_motion`; S = 0 without sway.
     """
 
     states: Tensor
@@ -95,7 +95,7 @@ def gather(
 
 
 def cut(corpus: ArigCorpus, starts: Tensor, window: int) -> LabelledDyad:
-    """Return the windows at (B,) starts as the model takes them."""
+    """Return the windows at (B,) starts as inputs of the model, with sound in single precision."""
     found = corpus.cut(starts, window)
     return replace(found, user_sound=found.user_sound.float(), agent_sound=found.agent_sound.float())
 
@@ -130,8 +130,8 @@ def _audio_features(
 ) -> tuple[Tensor, Tensor, bool]:
     """Return features (N, A) of a track in half precision, speech (N,), and whether there is a track.
 
-    Without a user's track the microphone is missing; zeros in an agent's mean a silent robot. wav2vec2 features come
-    with the data, as the feature `shipped`, and take the place of the mel rows.
+    A missing track of the user means a missing microphone; zeros in the agent's mean a silent robot. wav2vec2 features
+    come with the data, as the feature `shipped`, and replace the mel rows.
     """
     frames, wide = len(dyad.listener), width != audio_frontend.WIDTHS["mel"]
     if wide and shipped in dyad.features:
@@ -151,11 +151,10 @@ def _audio_features(
 
 
 def reflection(before: Tensor, after: Tensor) -> Tensor:
-    """Return Burg's coefficient (C,) of values of mean 0, (M, C) each: the share of one in the other, in either
-    direction.
+    """Return Burg's coefficient (C,) of values of mean 0, (M, C) each.
 
-    Within -1..1: no autoregression with such coefficients grows (J. P. Burg, 1967). A constant channel has coefficient
-    1.
+    It is the share of one in the other, in either direction, within -1..1: no autoregression with such coefficients
+    grows (J. P. Burg, 1967). A constant channel has coefficient 1.
     """
     power = (before.double().square() + after.double().square()).sum(0)
     found = 2 * (before.double() * after.double()).sum(0) / power.clamp(min=1e-9)
@@ -165,7 +164,7 @@ def reflection(before: Tensor, after: Tensor) -> Tensor:
 def _fit_steps(model: ArigModel, of_dyads: Sequence[Tensor], remains: Tensor | None) -> Tensor:
     """Fit the steps on standardised motion (M, C) of every dyad without its events; return the part (N, C) to draw.
 
-    `remains` (N, C): of `told`; None without events.
+    `remains` (N, C): from `event_curves.remains`; None without events.
     """
     last, now = (torch.cat([one[part] for one in of_dyads]) for part in (slice(None, -1), slice(1, None)))
     if remains is not None:
@@ -182,14 +181,14 @@ def _fit_steps(model: ArigModel, of_dyads: Sequence[Tensor], remains: Tensor | N
 
 
 def _fit_events(model: ArigModel, standard: Tensor, control: Tensor, corpus: ArigCorpus) -> tuple[list[Tensor], Tensor]:
-    """Fit what events do to a face on average, and how far a face at rest, without events and speech, is from that.
+    """Fit the average motion of events, and the distance from it of faces at rest, without events and speech.
 
-    Return the motion (M, C) of every dyad less its events, of standardised motion (N, C), and
-    `event_curves.remains` of every frame but the first of a dyad.
+    Return the motion (M, C) of every dyad minus that of its events, from standardised motion (N, C), and
+    `event_curves.remains` of every frame except the first of a dyad.
     """
     model.told.copy_(event_curves.fit(control, standard))
     sides = [name in LATERAL_POSE for name in model.settings.channels]
-    model.told[:, sides] = 0.0  # no input says to which side a shake begins, so none is on average
+    model.told[:, sides] = 0.0  # no input has the side to which a shake begins, so the average has none
     controls, still = corpus.by_dyad(control), []
     of_dyads = [motion - event_curves.features(rows) @ model.told
                 for motion, rows in zip(corpus.by_dyad(standard), controls, strict=True)]  # fmt: skip
@@ -205,9 +204,9 @@ def _fit_events(model: ArigModel, standard: Tensor, control: Tensor, corpus: Ari
 
 
 def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
-    """Return how long each of the paper's states lasts, and which states occur with which voices."""
+    """Set the durations of the paper's states, and which states are possible with which voices."""
     labels = corpus.frames.states
-    labels = torch.where(labels >= NODDING, LISTENING, labels)  # feedback that is seen lies on top
+    labels = torch.where(labels >= NODDING, LISTENING, labels)  # visible feedback counts as listening
     of_dyads = corpus.by_dyad(labels)
     places = torch.linspace(0, 1, QUANTILES)
     for state in range(len(STATES)):
@@ -223,10 +222,10 @@ def _fit_states(states: StateUnderstanding, corpus: ArigCorpus) -> None:
 
 
 def fit_scales(model: ArigModel, corpus: ArigCorpus) -> None:
-    """Set means and deviations of motion and sound, and the range that the sampler keeps to."""
+    """Set means and deviations of motion and sound, and the range of the sampler."""
     frames, channels = corpus.frames, model.settings.channels
     mean, spread = motion_scales(frames.agent_motion, channels)
-    if frames.user_seen.any():  # what is not drawn, or made apart, is seen all the same
+    if frames.user_seen.any():  # channels not drawn, or made separately, are still inputs
         whole = model.is_drawn & model.is_recalled
         spread = torch.where(whole, spread, motion_scales(frames.user_motion[frames.user_seen], channels)[1])
     model.motion_mean.copy_(mean)
@@ -238,7 +237,7 @@ def fit_scales(model: ArigModel, corpus: ArigCorpus) -> None:
     if model.is_told and frames.control is not None:
         of_dyads, remains = _fit_events(model, standard, frames.control, corpus)
     drawn = _fit_steps(model, of_dyads, remains)
-    if model.settings.sway:  # of listening where there is any: speakers sway further, and no input tells them apart
+    if model.settings.sway:  # of listening if there is any: speakers sway further, and no input marks them
         slow = corpus.by_dyad(frames.sway)
         listening = [one for one, scene in zip(slow, corpus.scenes, strict=True) if scene == "listening"]
         fit_sway(model, listening or slow)

@@ -1,4 +1,4 @@
-"""Training of ARIG: one phase, windows that begin as a stream does, teacher forcing, and the paper's curriculum."""
+"""Training of ARIG: one phase, windows that begin like a stream, teacher forcing, and the paper's curriculum."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def train_arig(
 ) -> dict[str, Any]:
     """Train on `data`/train (and its speaking/ and interaction/) and write `out`/config.yaml and model.safetensors.
 
-    Weights are written in 16 bits: a frame differs by less than a hundredth of its spread (a test).
+    Weights are written in 16 bits: a test checks that a frame differs by less than a hundredth of its spread.
 
     Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` continues.
     """
@@ -126,11 +126,11 @@ def weights_of(stage: config.Stage, starts: Mapping[str, Tensor]) -> Tensor:
 
 
 def starts_by_event(corpus: ArigCorpus, starts: Mapping[str, Tensor], window: int) -> dict[str, list[Tensor]]:
-    """Return by scene, for every kind of event but blinks in it, those of the `starts` whose window has one."""
+    """Return by scene, for every kind of event in it except blinks, the `starts` whose window has such an event."""
     control, found = corpus.frames.control, {}
     if control is None or not control.shape[-1]:
         return {}
-    before = torch.zeros(len(control) + 1, len(ACTIVE), dtype=torch.int32)  # frames with one, before each frame
+    before = torch.zeros(len(control) + 1, len(ACTIVE), dtype=torch.int32)  # number of frames with one before it
     before[1:] = (control[:, ACTIVE] > 0).cumsum(0)
     for scene, firsts in starts.items():
         has = before[firsts + window] > before[firsts]
@@ -148,7 +148,7 @@ def draw(
 ) -> Tensor:
     """Draw first frames (count,): a scene by its weight, then any of its windows.
 
-    `share` of them are of one of its `eventful` sets instead, any of these and then any of the set.
+    A `share` of them is drawn from the scene's `eventful` sets: any of these sets, then any of its windows.
     """
     scenes = torch.multinomial(weights, count, replacement=True, generator=generator)
     places, kinds, busy = torch.rand(3, count, generator=generator, dtype=torch.float64).tolist()
@@ -162,7 +162,7 @@ def draw(
 
 @torch.no_grad()
 def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase) -> LossParts:
-    """Return the losses, without augmentation, on windows drawn with a fixed seed as the last stage draws them."""
+    """Return the losses, without augmentation, on windows drawn with a fixed seed and the last stage's weights."""
     student.eval()
     generator = Generator().manual_seed(0)
     starts = corpus.starts_by_scene(phase.window_frames)
@@ -178,17 +178,17 @@ def held_out_parts(student: Student, corpus: ArigCorpus, phase: config.ArigPhase
 #
 # loss = L(3) + state_weight * CE(states, 3.3) + coarse_weight * |coarse motion - motion|^2 (3.4)
 #
-# Every frame gets the true past (teacher forcing). The paper states (3) and the cross-entropy; that the coarse motion
-# is held to the motion itself, through a linear layer that is thrown away afterwards, is ours: it makes lips follow
-# sounds within fewer steps. So are weights of groups of channels: by number, (3) is about the mouth.
+# Every frame gets the true past (teacher forcing). The paper states (3) and the cross-entropy. Ours: the coarse motion
+# is compared with the motion itself, through a linear layer that is discarded afterwards, so that lips follow sounds
+# after fewer steps. Also ours: weights of groups of channels, since most channels in (3) belong to the mouth.
 
-RETURN = 0.1  # share of the slow part of the noise on the past that one frame takes back
+RETURN = 0.1  # share of the slow part of the noise on the past that one frame removes
 COLOURS = 4  # waves over the bands that make up another microphone's colour
-JUMPS = 0.04  # of frames at which the slow part goes elsewhere
-GLIDE = 12  # frames that it takes for that, at most
+JUMPS = 0.04  # share of frames at which the slow part moves to another value
+GLIDE = 12  # most frames that this takes
 COLD = 0.5  # share of windows whose past is exact
-SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds decide while it speaks
-# Groups of channels, by how their names begin; the mouth has the rest.
+SPOKEN = ("jaw", "mouth", "tongue")  # channels that the agent's own sounds determine while it speaks
+# Groups of channels, by the beginnings of their names; the mouth has the rest.
 GROUPS: Final = {
     "head": (*POSE_CHANNELS, "rotation", "translation", "head"),
     "lids": ("eye",),
@@ -198,7 +198,7 @@ GROUPS: Final = {
 
 
 class Student(nn.Module):
-    """The model, and the layer that reads motion off its coarse motion while it learns."""
+    """The model, and the layer that maps its coarse motion to motion during training."""
 
     def __init__(self, model: ArigModel) -> None:
         super().__init__()
@@ -227,8 +227,8 @@ def loss_parts(
         told: Inputs of the model, the past possibly noisy.
         states: (B, N) int64, -1 where not labelled.
         truth: (B, N, C) motion to be predicted after this past.
-        phase: Its `group_weights` are of `GROUPS` in equation (3); None: every channel counts the same.
-        generator: Of noise levels and of the previous states.
+        phase: Its `group_weights` weigh `GROUPS` in equation (3); None: every channel counts the same.
+        generator: Draws noise levels and previous states.
     """
     model = student.model
     weights = None
@@ -248,8 +248,8 @@ def loss_parts(
 def state_loss(logits: Tensor, states: Tensor, selected: bool | None = None) -> Tensor:
     """Return the cross-entropy of labelled frames, 0 without any; logits (B, T, S), states (B, T), -1 not labelled.
 
-    `selected`: rows of those frames are taken out, which makes the host wait for a GPU; None: on a CPU alone. The sums
-    are added in another order.
+    `selected`: the rows of those frames are selected first, which makes the host wait for a GPU; None: only on a CPU.
+    The two ways add in different orders.
     """
     known = states >= 0
     if not (logits.device.type == "cpu" if selected is None else selected):
@@ -265,7 +265,7 @@ def group_of(channel: str) -> str:
 
 @lru_cache(maxsize=8)
 def channel_weights(channels: tuple[str, ...], drawn: tuple[str, ...], groups: config.GroupWeights) -> Tensor:
-    """Return weights (C,) that add up to 1: a group's weight, shared by those of its channels that are `drawn`."""
+    """Return weights (C,) that add up to 1: a group's weight, divided among those of its channels that are `drawn`."""
     members = Counter(group_of(name) for name in drawn)
     weights = torch.zeros(len(channels))
     for index, name in enumerate(channels):
@@ -277,11 +277,11 @@ def channel_weights(channels: tuple[str, ...], drawn: tuple[str, ...], groups: c
 def augment(dyad: ArigDyad, model: ArigModel, phase: config.ArigPhase, generator: Generator) -> tuple[ArigDyad, Tensor]:
     """Return windows with missing modalities, other microphones and a noisy past; and the motion (B, N, C) after it.
 
-    The past is off by a slow part, of which the frame after it takes back a tenth, and by a fast one, all of it. Taking
-    everything back at once would be a jump that no sound and no state explains, and streams would learn to jitter. A
-    head whose past is not told is as it was.
-    Lips are another matter while the agent speaks: its sounds say where they have to be, so their past is off by more,
-    in every window, and all of it is taken back at once.
+    The noise on the past has a slow part, of which the next frame removes a tenth, and a fast part, which it removes
+    completely. Removing everything at once would be a jump that no sound and no state explains, and streams would learn
+    to jitter. A head whose past is not an input of the model gets no noise.
+    Lips differ while the agent speaks: its sounds determine their place, so their past has more noise, in every window,
+    and all of it is removed at once.
     """
     b, n = dyad.user_heard.shape
     device = dyad.agent_motion.device
@@ -318,7 +318,7 @@ def augment(dyad: ArigDyad, model: ArigModel, phase: config.ArigPhase, generator
     return told, dyad.agent_motion + torch.where(spoken, 0.0, carried)
 
 
-# Returns a constant on a device, where it stays for good: it goes there once.
+# Returns a constant on a device; it is sent there once and then kept.
 sent: Final = lru_cache(maxsize=32)(Tensor.to)
 
 
@@ -341,7 +341,7 @@ def _silence(frames: int) -> Tensor:
 
 
 def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, generator: Generator) -> Tensor:
-    """Draw what another microphone would add (B, N, A) to logarithms of power; nothing to other features."""
+    """Draw the offsets (B, N, A) of another microphone to logarithms of power; 0 for other features."""
     place = generator.device
     off = torch.zeros(b, n, model.sound_width, device=place)
     if model.settings.sound != "mel" or not is_drawn(generator, phase.gain_db, phase.colour_db, phase.grain_db):
@@ -361,7 +361,7 @@ def _microphone(b: int, n: int, model: ArigModel, phase: config.ArigPhase, gener
 def _in_a_room(
     sound: Tensor, voiced: Tensor, silent: Tensor, model: ArigModel, phase: config.ArigPhase, generator: Generator
 ) -> Tensor:
-    """Return sound (B, N, A) of the user with some non-speech (voiced (B, N, 1)) or all of it (silent (B, 1)) removed.
+    """Return the user's sound (B, N, A), weaker without speech (voiced (B, N, 1)), or all silence (silent (B, 1)).
 
     Silence has the features of a stream's start. Features other than logarithms of power are unchanged.
     """
@@ -378,9 +378,9 @@ def _in_a_room(
 
 
 def _wander(b: int, n: int, channels: int, phase: config.ArigPhase, generator: Generator) -> tuple[Tensor, Tensor]:
-    """Return noise (B, N, C) on the past of half of the windows: slow, in deviations of motion, and fast, in those of
-    steps.
+    """Return slow and fast noise (B, N, C) on the past of half of the windows.
 
+    The slow part is in deviations of the motion, the fast part in those of its steps.
     The slow part jumps or glides to a new value about once a second, and decays by a tenth per frame. A glide resembles
     the drift of a stream: its speed does not continue in the frames after it.
     """
@@ -391,9 +391,9 @@ def _wander(b: int, n: int, channels: int, phase: config.ArigPhase, generator: G
     size = size * (uniform(generator, b, 1, 1) >= COLD)
     jumps = normal(generator, b, n, channels)
     jumps = jumps * (uniform(generator, b, n, 1) < JUMPS)
-    # Each is spread evenly over the frames from it on: 1 to `GLIDE`, drawn for each window.
+    # Each jump is spread evenly over the next 1 to `GLIDE` frames, a number drawn for each window.
     frames = torch.randint(1, GLIDE + 1, (b, 1), generator=generator, device=jumps.device)
-    total = torch.cat([torch.zeros_like(jumps[:, :1]), jumps.cumsum(1)], dim=1)  # of those before each frame
+    total = torch.cat([torch.zeros_like(jumps[:, :1]), jumps.cumsum(1)], dim=1)  # sum of the jumps before each frame
     before = (torch.arange(1, n + 1, device=jumps.device) - frames).clamp(min=0)
     jumps = (total[:, 1:] - total.gather(1, before[..., None].expand(-1, -1, channels))) / frames[..., None]
     fast = normal(generator, b, n, channels)
@@ -401,9 +401,9 @@ def _wander(b: int, n: int, channels: int, phase: config.ArigPhase, generator: G
 
 
 def decayed(jumps: Tensor, at_once: bool | None = None) -> Tensor:
-    """Return jumps (B, N, C), each with what `RETURN` a frame has left of those before it.
+    """Return for each frame the sum (B, N, C) of the jumps so far, each of which decays by `RETURN` a frame.
 
-    `at_once`: as one product, for a GPU; None: on a GPU alone. The sums are added in another order.
+    `at_once`: compute it as one product, for a GPU; None: only on a GPU. The two ways add in different orders.
     """
     n = jumps.shape[1]
     if jumps.device.type != "cpu" if at_once is None else at_once:
@@ -422,8 +422,9 @@ def _left(frames: int) -> Tensor:
 
 
 def previous_states(states: Tensor, share: float, generator: Generator, count: int) -> Tensor:
-    """Return the states (B, N) for the model: unlabelled ones count as `waiting`, a share is drawn at random of
-    `count`.
+    """Return the previous states (B, N) as inputs of the model.
+
+    Unlabelled ones count as `waiting`; a `share` is drawn at random from `count` states.
     """
     known = torch.where(states < 0, FIRST, states)
     if not is_drawn(generator, share):

@@ -1,8 +1,8 @@
-"""Fits of hazards on meetings: evidence of every step, onsets against the steps in which nothing began.
+"""Fits of hazards on meetings: evidence of every step, onsets compared with the steps in which no event began.
 
     nod, shake, tilt, laugh, mm_hm     as annotated
     smile, brow_raise                  not annotated: drawn as in composed dyads, from smiles and laughs of others, own
-                                       "mm-hm" and nods, and from questions asked; a reaction late
+                                       "mm-hm" and nods, and from questions asked; with a reaction time
     gaze_shift                         a look away from a person who speaks or has the floor, where annotated
 
 A hazard is evaluated every 80 ms; an event belongs to the step in which it begins. Of the steps without an onset one in
@@ -40,12 +40,12 @@ from sfms_robot.signals.phase import piecewise_linear_basis
 
 _Number = TypeVar("_Number", bound=np.generic)
 Knots = tuple[float, ...]
-Groups = Mapping[str, Knots]  # evidence -> knots of its curve; none for a number
+Groups = Mapping[str, Knots]  # evidence -> knots of its curve; no knots for a number
 
-KEPT: Final = 6  # of the steps without an onset, one in so many
-PRIOR_NODS, PRIOR_PER_MINUTE = 3.0, 2.2  # of a person's rate so far
-LEAST_ONSETS: Final = 3  # of a person in a meeting, to be ranked
-# Long ago these no longer matter: their last hat is left out, their last value 0.
+KEPT: Final = 6  # one of this many steps without an onset is kept
+PRIOR_NODS, PRIOR_PER_MINUTE = 3.0, 2.2  # prior of a person's rate of nods so far
+LEAST_ONSETS: Final = 3  # onsets of a person in a meeting that are needed to rank them
+# Evidence that has no effect after a long time: its last basis function is left out, its last value is 0.
 FORGOTTEN: Final = frozenset(
     ("holder_silence_s", "own_voice_s", "nod_s", "nod_end_s", "mm_hm_s", "laugh_end_s", "smile_end_s", "shake_end_s",
      "tilt_end_s", "brow_raise_end_s", "looked_at_silence_s", "laugh_s", "others_nod_s", "others_smile_s")
@@ -86,7 +86,7 @@ STUDY: Final[Groups] = {  # 89 inputs
     **GAZE,
     **OTHERS,
 }
-STUDY_RIDGE, RIDGE = 10.0, 3.0  # the second, and what is added below, did better on validation
+STUDY_RIDGE, RIDGE = 10.0, 3.0  # `RIDGE`, and the evidence added below, did better on validation
 THEIR_SMILE: Final[Groups] = {"others_smile_s": (0.0, 0.06, 0.12, 0.24, 0.4, 0.8, 1.6, 3.2)}
 GROUPS: Final[Mapping[str, Groups]] = {
     "nod": {**STUDY, **OWN_VOICE, "mm_hm_s": _WHILE, "laugh_end_s": _WHILE},
@@ -118,8 +118,8 @@ GROUPS: Final[Mapping[str, Groups]] = {
 
 
 LEARNED: Final = ("nod", "shake", "tilt", "laugh", "smile", "mm_hm", "brow_raise", "gaze_shift")
-REACTION_S: Final = 0.3  # of a smile to a laugh, of brows to a question
-SEEN_S: Final = 0.68  # from the onset of another's smile until `evidence` has it; before it none can be returned
+REACTION_S: Final = 0.3  # of a smile after a laugh, of brows after a question
+SEEN_S: Final = 0.68  # from the onset of another's smile until `evidence` has it; no smile is returned earlier
 LEAD_S: Final = LEAD_FRAMES * FRAME_S  # from a decision until its event begins
 BROWS: Final = {"question": 0.5, "nod": 0.15}
 SMILE_S, BROW_S = 1.6, 0.8
@@ -130,8 +130,8 @@ class EventStudent:
     """Training rows of one person in one meeting: M steps of 80 ms.
 
     Attributes:
-        scene: Of all frames.
-        evidence: (M, len(EVIDENCE)) as each step begins.
+        scene: Scene of all frames.
+        evidence: (M, len(EVIDENCE)) at the beginning of each step.
         listening: (N,) frames in which the person listens.
         lessons: by kind.
     """
@@ -147,7 +147,7 @@ def student(person: MeetingPerson, rng: Rng) -> EventStudent:
     """Return the training rows of one person; `rng` draws the events that were not annotated."""
     scene, listening = meeting_scene(person)
     smiles, laughs = sizes.others_smiles(len(listening) * FRAME_S, rng.spawn(1)[0]), person.others_laughs
-    # Laughs are seen as `render_events.speaker_motion` lays them.
+    # Laughs are visible as `render_events.speaker_motion` shows them.
     seen = np.stack([laughs[:, 0] - 0.2, laughs[:, 1] + 1.1, np.full(len(laughs), np.mean(sizes.LAUGH))], axis=1)
     shown = np.zeros(len(listening))  # sizes of smiles, from when they are seen until they end
     for start, end, size in np.concatenate([smiles, seen]).tolist():
@@ -175,15 +175,16 @@ def _seen(start_s: float) -> int:
 
 
 def muted(one: EventStudent) -> EventStudent:
-    """Return the rows without the person's own voice among the evidence."""
+    """Return the rows without the person's own voice in the evidence."""
     evidence = one.evidence.copy()
     evidence[:, : len(HEARD)] = by_step(heard_in(unspoken(one.scene)), np.nan)
     return replace(one, evidence=evidence)
 
 
 def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
-    """Return (N,) the logarithm of a person's nods per minute of listening so far, shrunk toward the mean while it
-    is short.
+    """Return (N,) the logarithm of a person's nods per minute of listening so far.
+
+    It is shrunk toward the mean while the listening time is short.
     """
     begun = np.searchsorted(np.sort(nods_s[:, 0]), (np.arange(len(listening)) + 1) * FRAME_S - 1e-6)
     listened = np.cumsum(listening) / FRAME_HZ / 60
@@ -191,7 +192,7 @@ def log_rate(nods_s: Doubles, listening: Bools) -> Doubles:
 
 
 def step_at(times_s: Doubles, step_s: float) -> Ints:
-    """Return in which step of this length each time lies; one that is hardly before a step lies in it."""
+    """Return the index of the step of this length in which each time lies; a time just before a step counts in it."""
     return np.floor(times_s / step_s + 1e-6).astype(np.int64)
 
 
@@ -209,8 +210,8 @@ class Lesson:
     """One kind of event of one person, M steps of 80 ms.
 
     Attributes:
-        onsets: (K,) steps in which one begins that could.
-        may: (M,) steps in which it could begin: the person listens and is not inside one.
+        onsets: (K,) steps in which an event begins that could begin there.
+        may: (M,) steps in which an event could begin: the person listens and no such event is under way.
     """
 
     onsets: Ints
@@ -218,7 +219,7 @@ class Lesson:
 
 
 def by_step(frames: NDArray[_Number], before: float = False) -> NDArray[_Number]:
-    """Map frames (N, ...) to steps (N // 2, ...), by the last frame before each; `before` stands before the first."""
+    """Map frames (N, ...) to steps (N // 2, ...), by the last frame before each; `before` for the first."""
     known = np.concatenate([np.full_like(frames[:1], before), frames[STEP_FRAMES - 1 :: STEP_FRAMES]])
     return known[: len(frames) // STEP_FRAMES]
 
@@ -226,14 +227,14 @@ def by_step(frames: NDArray[_Number], before: float = False) -> NDArray[_Number]
 def spans_of(person: MeetingPerson, rng: Rng, others_smiles: Doubles) -> dict[str, Doubles]:
     """Return spans (K, 2) of all events of the person; those that were not annotated are drawn.
 
-    `others_smiles`: (K, 3) start, end [s], size. One that is returned before it can be seen is returned then.
+    `others_smiles`: (K, 3) start, end [s], size. A smile is returned at the earliest when it can be seen.
     """
     nods, after = person.nods[:, 0], sizes.SMILES_AFTER
     smiles = [_some(person.others_laughs[:, 0], after["laugh"], rng) + REACTION_S]
     smiles += [_some(person.mm_hms[:, 0], after["mm_hm"], rng), _some(nods, after["nod"], rng)]
     for smile in others_smiles:
         answers = sizes.returned(smile[None], rng)
-        first = np.ceil((_seen(smile[0]) + 1) / STEP_FRAMES) * STEP_S  # the first step that knows of it
+        first = np.ceil((_seen(smile[0]) + 1) / STEP_FRAMES) * STEP_S  # the first step that has it in its evidence
         smiles.append(np.maximum(answers[:, 0] - LEAD_S, first))
     brows = _some(person.asked, BROWS["question"], rng)
     return {
@@ -257,13 +258,13 @@ def _spans(starts_s: Doubles, length_s: float) -> Doubles:
 
 
 def lesson(spans_s: Doubles, listening: Bools) -> Lesson:
-    """Return the lesson of events (K, 2); none begins inside another."""
+    """Return the lesson of events (K, 2); no event can begin inside another."""
     taken = near(spans_s + [0.0, -FRAME_S], len(listening), 0.0)
     begins = step_at(spans_s[:, 0], STEP_S)
     heard = by_step(listening)
     onsets = np.unique(begins[(begins >= 0) & (begins < len(heard))])
     onsets = onsets[heard[onsets]]
-    may = heard & ~taken[: len(heard) * STEP_FRAMES : STEP_FRAMES]  # that one is over is known as it ends
+    may = heard & ~taken[: len(heard) * STEP_FRAMES : STEP_FRAMES]  # an event counts as over once it ends
     may[onsets] = True
     return Lesson(onsets, may)
 
@@ -271,7 +272,8 @@ def lesson(spans_s: Doubles, listening: Bools) -> Lesson:
 def looks_of(person: MeetingPerson, scene: Scene) -> tuple[Doubles, Bools, Lesson]:
     """Return the gaze of a person with annotations: the spans (K, 2) from each shift to the next, aside (K,), a lesson.
 
-    A look goes aside if its target neither speaks nor has the floor. In the lesson the gaze leaves such a person.
+    A look goes aside if its target neither speaks nor has the floor. In the lesson the gaze leaves a target that speaks
+    or has the floor.
     """
     counts, gaze, agents = counts_in(scene), person.gaze or (), agents_of(person)
     frames = len(counts)
@@ -300,7 +302,7 @@ def minutes(mask: Bools) -> float:
 
 # --- A meeting from the place of one of its people, frame by frame: who speaks, who looks at them, who laughs and nods
 #
-# `listeners.events.evidence` makes its numbers of that; annotations take the place of a microphone and a camera.
+# `listeners.events.evidence` computes its numbers from this; annotations replace a microphone and a camera.
 
 
 def agents_of(person: MeetingPerson) -> tuple[str, ...]:
@@ -329,7 +331,7 @@ def meeting_scene(person: MeetingPerson) -> tuple[Scene, Bools]:
 
 
 def listening_in(person: MeetingPerson, stretch: Stretch) -> Bools:
-    """Return (N,): others spoke in the last 2 s, the participant is silent and in view."""
+    """Return a mask (N,): others spoke in the last 2 s, and the participant is silent and in view."""
     others, own, unseen = (active(spans, stretch) for spans in (person.others, person.talk, person.unseen))
     listening: Bools = listening_mask(others, own) & ~unseen
     return listening
@@ -339,7 +341,7 @@ def listening_in(person: MeetingPerson, stretch: Stretch) -> Bools:
 
 
 def inputs(evidence: Doubles, groups: Groups) -> Floats:
-    """Map evidence (M, len(EVIDENCE)) to inputs (M, K): hats of curves and plain numbers, in the groups' order."""
+    """Map evidence (M, len(EVIDENCE)) to inputs (M, K): basis functions of curves, and numbers, by group."""
     parts = []
     for name, knots in groups.items():
         value = evidence[:, AT[name]]
@@ -366,7 +368,7 @@ def teach(students: Iterable[EventStudent], kind: str, groups: Groups, seed: int
 
 
 def hazard(learned: Logistic, groups: Groups, learned_from: str, per_minute: float) -> Hazard:
-    """Return the fitted hazard as the file has it: curves by knot."""
+    """Return the fitted hazard in the form of the file, with curves by knot."""
     weights: dict[str, float | dict[float, float]] = {}
     at = 0
     for name, knots in groups.items():
@@ -408,7 +410,7 @@ def ranked(students: Iterable[EventStudent], kind: str, score: Callable[[Doubles
 # --- Logistic regression with a ridge, by Newton's method: few inputs, many rows, no options ----------------------
 
 NEWTON_STEPS: Final = 8
-_ROWS: Final = 65_536  # at once
+_ROWS: Final = 65_536  # rows processed at once
 
 
 @dataclass(frozen=True)
@@ -435,7 +437,7 @@ def fit(inputs: Floats, happens: Doubles, counts: Doubles, ridge: float = 10.0) 
     before, fit_before = at, -np.inf
     for _ in range(NEWTON_STEPS):
         goodness, slope, bend = _at(at, inputs, happens, counts, penalty)
-        while not goodness >= fit_before:  # too far: a start at the mean may overshoot
+        while not goodness >= fit_before:  # the step was too long: it may overshoot from the mean
             at = (at + before) / 2
             goodness, slope, bend = _at(at, inputs, happens, counts, penalty)
         before, fit_before = at, goodness - 1e-9 * abs(goodness)
@@ -460,7 +462,7 @@ def _at(
     return goodness, slope, bend
 
 
-# --- nods of people and of hazards, counted alike --------------------------------------------------------------------
+# --- nods of people and of hazards, counted in the same way ----------------------------------------------------------
 
 
 def count(one: EventStudent, onsets_s: Doubles) -> tuple[Sums, Doubles]:

@@ -1,6 +1,6 @@
-"""Behind `train events`: meetings in, one readable file of hazards and shapes out, and what it is worth on others.
+"""Functions behind `train events`: fit hazards and shapes on meetings, write one readable file, evaluate it on others.
 
-Taught on the people of training; ranked and rolled out on those of validation. Nobody of test is looked at.
+It is fitted on the people of training; ranked and rolled out on those of validation. People of test are not used.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ from sfms_robot.signals.motion_primitives import Motions
 
 Students = Sequence[EventStudent]
 
-# Part of people's nods begin in the 0.2 s after a phrase in which no head can know that it is over: the fit sees them
-# within phrases, and a head's begin 0.12 s after they are decided. So fewer of a head's nods follow a phrase than of
-# people's, unless it nods less while one lasts (by `LESS`), and more at these knots of silence, once the end is known
-# (`MORE`). How much was chosen on validation, by the phrase-end ratio of nods that a silent head decides.
+# Some of people's nods begin in the 0.2 s after a phrase in which a head cannot know yet that it is over: the fit has
+# them within phrases, and a head's nods begin 0.12 s after they are decided. So fewer of a head's nods than of people's
+# would follow a phrase. As a correction a head nods less in a phrase (`LESS`), and more at these knots of silence, when
+# the end is known (`MORE`). Both were chosen on validation, by the phrase-end ratio of nods decided by a silent head.
 END_KNOWN: Final = [len(PHASE["phrase_s"]) + PHASE["silence_s"].index(knot_s) for knot_s in (0.24, 0.4)]
 LESS, MORE = 0.1, 0.15  # log-odds
-KNOBS: Final = (1.0, 2.2, 4.0)  # nods a minute, rolled out
-# AUC of the same kinds in a study of all 36 meetings by six-fold cross-validation, to stand beside.
+KNOBS: Final = (1.0, 2.2, 4.0)  # nods a minute in the roll-outs
+# AUC of the same kinds in a study of all 36 meetings by six-fold cross-validation, for comparison.
 STUDY_AUC: Final[Mapping[str, float]] = {"nod": 0.674, "mm_hm": 0.747, "laugh": 0.822}
 FROM: Final[Mapping[str, str]] = {
     "nod": "concord signals (form nod, or left blank), AMI",
@@ -76,8 +76,10 @@ e15614560ba7b0c1121e3d82c8a6e29c57cff5bd, Apache-2.0. Blinks, brows and sizes: m
 
 
 def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> Figures:
-    """Write `out` (if given) and return the figures. Raises ConfigError, also for tables in which people never do what
-    is to be learned, such as gaze or laughs. Without people of validation nothing is ranked.
+    """Fit all hazards, write `out` (if given) and return the figures.
+
+    Raises ConfigError, also for tables without a kind of event that is to be learned, such as gaze or laughs. Without
+    people of validation nothing is ranked.
 
     `all_series`: train on all people, validation and test included, without ranking: only for comparison with a study
     that used the same meetings, by its recipe (89 inputs of nods, ridge 10), never for use.
@@ -98,12 +100,12 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> F
     groups, ridge = ({**GROUPS, "nod": STUDY}, STUDY_RIDGE) if all_series else (GROUPS, RIDGE)
     hazards = {}
     judged_silent = [event_trainer.muted(one) for one in judged]
-    # Each with and without the own voice.
+    # Every person with and without the own voice.
     examples = taught if all_series else [*taught, *(event_trainer.muted(one) for one in taught)]
     for kind in tracked(LEARNED, "kinds of events"):
         learned = event_trainer.teach(examples, kind, groups[kind], seed, ridge)
         if kind == "nod" and not all_series:
-            learned.weights[: len(PHASE["phrase_s"])] -= LESS  # these are the first inputs, those of silence next
+            learned.weights[: len(PHASE["phrase_s"])] -= LESS  # the first inputs are of phrase_s, the next of silence_s
             learned.weights[END_KNOWN] += MORE
         lessons = [one.lessons[kind] for one in taught if kind in one.lessons]
         per_minute = sum(len(one.onsets) for one in lessons) / sum(event_trainer.minutes(one.may) for one in lessons)
@@ -128,7 +130,7 @@ def train_events(data: Path, out: Path | None, all_series: bool, seed: int) -> F
 
 
 def save(file: Path, found: EventTables) -> None:
-    """Write the tables as YAML below where they come from. Raises ConfigError when that fails."""
+    """Write the tables as YAML, below a header with their sources. Raises ConfigError when that fails."""
     plain = found.model_dump(mode="python", exclude_defaults=True)
     for shape in plain["shapes"].values():
         for name, values in shape.items():
@@ -148,9 +150,9 @@ def _judged(
     judged: Students,
     silent: Students,
 ) -> Figures:
-    """Return what a hazard was learned from, and how it ranks the onsets of other people: mean over them, interval.
+    """Return counts of a hazard's training data, and its ranking of the onsets of other people: mean and interval.
 
-    `silent`: those people without their own voice among the evidence, as a head hears that never speaks.
+    `silent`: those people without their own voice in the evidence, like a head that never speaks.
     """
     lessons = [one.lessons[kind] for one in taught if kind in one.lessons]
     found: Figures = {
@@ -185,7 +187,7 @@ def _judged(
 
 
 def _expected(given: Hazard, kind: str, people: Students) -> float | None:
-    """Return the events a minute that a hazard gives in the time of these people in which they may happen."""
+    """Return the expected events a minute of a hazard, in the time of these people in which they may happen."""
     rows = [one.evidence[one.lessons[kind].may] for one in people if kind in one.lessons]
     return rounded(float(expit(_log_odds(given, np.concatenate(rows))).mean()) * 60 / STEP_S)
 
@@ -195,13 +197,13 @@ def _mean(auc: Doubles) -> float | None:
 
 
 def _log_odds(given: Hazard, rows: Doubles) -> Doubles:
-    """Return the log-odds (M,) of a hazard for evidence (M, E), in parts that stay in a cache."""
+    """Return the log-odds (M,) of a hazard for evidence (M, E), in parts that fit a cache."""
     bank, parts = HazardBank({"": given}), np.array_split(rows, max(1, len(rows) // 4096))
     return np.concatenate([bank.log_odds(bank.contributions(part))[:, 0] for part in parts])
 
 
 def _rolled_out(model: EventModel, judged: Students, seed: int) -> Figures:
-    """Return figures of the people's nods, and of nods alone decided in their places at each rate of `KNOBS`."""
+    """Return figures of the people's nods, and of nods alone decided in their place at each rate of `KNOBS`."""
 
     def counted(onsets_s: Iterable[Doubles]) -> tuple[dict[str, float], Doubles]:
         counts = [event_trainer.count(one, at) for one, at in zip(judged, onsets_s, strict=True)]
@@ -238,15 +240,15 @@ def _rows(figures: Figures) -> list[Figures]:
     ]
 
 
-# --- How long and how large: durations as people had them, the rest as composed dyads have it
+# --- Shapes: durations as people had them, the rest as in composed dyads --------------------
 #
-# A smile takes as long as one that composing lays: from onset to offset of the recorded curve, held while it is seen.
+# A smile lasts as long as in composed dyads: from onset to offset of the recorded curve, held while it is seen.
 
-STEPS: Final = 20  # between quantiles
-LONGEST_S: Final = 6.0  # of a nod, of a laugh
-DRAWN: Final = 400  # smiles
+STEPS: Final = 20  # intervals between quantiles
+LONGEST_S: Final = 6.0  # of an annotated event
+DRAWN: Final = 400  # number of smiles drawn
 _SHARES: Final = np.linspace(0, 1, STEPS + 1)
-_INNER: Final = np.clip(_SHARES, 0.01, 0.99)  # a tail has no end
+_INNER: Final = np.clip(_SHARES, 0.01, 0.99)  # the tails are infinite
 
 
 def shapes(students: Students, motions: Motions) -> dict[str, Shape]:
@@ -316,11 +318,11 @@ def _thousandths(values: Doubles) -> tuple[float, ...]:
     return tuple(round(float(value), 3) for value in values)
 
 
-# --- Hazards that the meetings alone cannot teach: blinks, of which nobody noted one, and looks away across no table
+# --- Hazards that the meetings alone cannot teach: blinks, which were not annotated, and looks away without a table
 #
-# Blinks come at recorded intervals, more often at the cues that composed dyads use. How speech makes people look away
-# is learned in the meetings, where slides and papers draw eyes for minutes; how often and for how long is that of 14
-# people who listened to one another with no table between them (`event_shapes`), and of the same people speaking.
+# Blinks come at recorded intervals, more often at the cues that composed dyads use. The effect of speech on looking
+# away is learned in the meetings, where slides and papers draw eyes for minutes. Rate and duration are those of 14
+# people who listened to one another with no table between them (`signals.event_sizes`), and of these people speaking.
 
 AT_PERSON_S: Final = 16.3  # mean seconds near the other's face, listening
 AT_PERSON_SPEAKING_S: Final = 1.47
@@ -342,7 +344,7 @@ def blink_hazard(gaps: Sequence[Floats]) -> Hazard:
 
 
 def look_away_hazard(found: Hazard, students: Iterable[EventStudent]) -> Hazard:
-    """Return `found` in the meetings, brought to how often people look away from one another."""
+    """Return the hazard `found` in the meetings, scaled to the rate at which people look away without a table."""
     weights = {name: weight for name, weight in found.weights.items() if name not in ("at_person_s", "own_voice_s")}
     more = round(float(np.log(AT_PERSON_S / AT_PERSON_SPEAKING_S)), 3)
     weights["own_voice_s"] = {0.0: more, 0.5: round(more / 2, 3), 1.0: 0.0}
@@ -352,7 +354,7 @@ def look_away_hazard(found: Hazard, students: Iterable[EventStudent]) -> Hazard:
 
 
 def at_rate(given: Hazard, kind: str, students: Iterable[EventStudent], per_minute: float) -> Hazard:
-    """Return the hazard with the intercept that gives `per_minute` in the steps in which it may happen."""
+    """Return the hazard with the intercept for `per_minute` in possible steps more than 1 s after the own voice."""
     rows = np.concatenate(
         [one.evidence[one.lessons[kind].may & (one.evidence[:, AT["own_voice_s"]] > 1.0)] for one in students
          if kind in one.lessons]

@@ -38,7 +38,7 @@ from sfms_robot.signals import phase as phases
 from sfms_robot.signals.voice_activity import mel_levels_db
 
 FASTEST = 0.9995  # quantile of a channel's steps that counts as its speed
-LEAST_SPEED = 0.05  # deviations a frame
+LEAST_SPEED = 0.05  # in deviations per frame
 
 log = logging.getLogger(__name__)
 
@@ -52,8 +52,8 @@ class SfmsFrames:
         face: (N, C) speaker, in the same space, 0 where unknown; face_known: (N,) bool.
         sound: (N, R, bins) half precision, features of the speaker's voice; heard: (N,) bool.
         phase: (N, F) the speaker's place in a phrase.
-        control: (N, K) control rows of the listener's events; K = 0 without.
-        sway: (N, S) the listener's slow motion, where it is not in `motion`; S = 0 without.
+        control: (N, K) control rows of the listener's events; K = 0 without events.
+        sway: (N, S) the listener's slow motion, if it is not in `motion`; S = 0 without sway.
     """
 
     motion: Tensor
@@ -75,13 +75,13 @@ def corpora(
     """Return the frames of train and validation, from a folder or a pack.
 
     `order`: of the channels in the files, if not the layout's own (`open_dataset`). `heard`: with the speaker's sound,
-    which a tokenizer does without.
+    which a tokenizer does not need.
     """
     listener, space = settings.listener, MotionSpace.of(settings.listener)
 
     def read(split: str) -> SfmsCorpus:
         dyads = open_for(space.name, data, split, order, [listener.audio] if heard else ())
-        if dyads.fps != FRAME_HZ and split == "train" and not heard:  # said once, in the first of two phases
+        if dyads.fps != FRAME_HZ and split == "train" and not heard:  # logged once, in the first of two phases
             log.warning(
                 "%s has %g frames a second and is not resampled; streamed, a listener shows %d a second",
                 data, dyads.fps, FRAME_HZ,
@@ -104,7 +104,7 @@ def gather(
     """Run `corpus.gather` in one motion space.
 
     `frontend` extracts features of the sound; None leaves the sound out, which is enough for a tokenizer.
-    `settings`: of a listener that may get events; None: one that does not.
+    `settings`: of a listener, which may have events; None for one without.
     """
     one = partial(frames_of, space=space, frontend=frontend, settings=settings)
     return dyads.gather({"listening": listened}, window, one, run, split)
@@ -143,7 +143,7 @@ def _audio_features(dyad: Dyad, frontend: AudioFrontend | None) -> tuple[Tensor,
         phase = at_rate(phases.of_audio(_whole(audio)), FRAME_HZ, frames, dyad.fps)
     elif frontend.phased and dyad.mel is not None:
         rows = dyad.mel.reshape(frames, mel.ROWS_PER_FRAME, mel.MEL_BINS)
-        ours = at_rate(rows, dyad.fps, math.ceil(frames * FRAME_HZ / dyad.fps), FRAME_HZ)  # phases count our frames
+        ours = at_rate(rows, dyad.fps, math.ceil(frames * FRAME_HZ / dyad.fps), FRAME_HZ)  # phases are in our frames
         phase = at_rate(phases.of_levels(mel_levels_db(ours)), FRAME_HZ, frames, dyad.fps)
     sound = (
         torch.zeros(frames, *frontend.shape) if found is None else torch.from_numpy(found).view(frames, *frontend.shape)
@@ -157,7 +157,7 @@ def _whole(audio: Floats) -> Floats:
 
 
 def fit_scales(model: SfmsModel, corpus: SfmsCorpus) -> None:
-    """Set the means, deviations and speeds of the model's motion, and its sway where that is apart."""
+    """Set the means, deviations and speeds of the model's motion, and its sway if that is separate."""
     mean, spread = motion_scales(corpus.frames.motion, model.settings.channels)
     model.motion_mean.copy_(mean)
     model.motion_std.copy_(spread)
@@ -180,16 +180,16 @@ def context(
     louder: Tensor | None = None,
     held: Tensor | None = None,
 ) -> Context[Tensor]:
-    """Return the predictor's inputs at the seam of each window, the tokens of the future undecided.
+    """Return the predictor's inputs at the end of each window's past, with the tokens of the future undecided.
 
     `tokens`: (N, G) of the corpus, or (B, T, G) of separate windows.
     `louder` (B,): added to the sound before it is standardised, for features that are logarithms.
-    `held` (N, G): tokens at a window's first frame, where the last keyframe is held (`held_tokens`).
+    `held` (N, G): tokens of a window's first frame, which holds the last keyframe (`held_tokens`).
     """
     frames, device = corpus.frames, model.motion_mean.device
     past, future = model.settings.past_frames, model.settings.future_frames
     starts = starts.to(frames.heard.device)
-    looked_at = torch.arange(-1, past, device=starts.device)  # one frame more: convolution looks back on it
+    looked_at = torch.arange(-1, past, device=starts.device)  # one frame more, for the convolution
     index = (starts[:, None] + looked_at).clamp(min=0)
     heard = frames.heard[index]
     heard[:, 0] &= ~corpus.begins[starts]
@@ -212,7 +212,7 @@ def context(
     )
 
 
-# --- Motion of a whole corpus as tokens: what phase 2 is trained on -----------------------------------------------
+# --- Tokens of the motion of a whole corpus, on which phase 2 is trained ------------------------------------------
 
 TOGETHER = 64  # stretches of one length that are placed at once
 STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many windows
@@ -222,8 +222,8 @@ STRETCH_WINDOWS = 10  # exact placement shares its keyframes among this many win
 def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> Tensor:
     """Place the keyframes (N, G) of all dyads.
 
-    Each dyad is placed as a whole where a keyframe has its cost; else stretch by stretch, so that busy seconds may
-    borrow from quiet ones of the same stretch.
+    `penalised` places each dyad as a whole, `exact` stretches of `STRETCH_WINDOWS` windows, so that busy seconds can
+    borrow keyframes from quiet ones of the same stretch, and every other strategy single windows.
     """
     pieces: list[Tensor] = []
     for dyad in torch.split(motion, list(lengths)):
@@ -234,7 +234,7 @@ def place_all(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int]) -> T
         sizes = [size] * whole
         if not sizes or rest >= tokenizer.window:
             sizes.append(rest)
-        else:  # no stretch is shorter than a window, unless there is only one
+        else:  # no stretch is shorter than a window, unless it is the only one
             sizes[-1] += rest
         pieces += torch.split(dyad, sizes)
     alike: dict[int, list[int]] = {}  # pieces of one length are placed together
@@ -258,7 +258,7 @@ def tokenise(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
 
 @torch.no_grad()
 def keyframe_tokens(model: SfmsModel, motion: Tensor) -> Tensor:
-    """Return the tokens (N, G) of each frame of standardised motion (N, C) as a keyframe."""
+    """Return the tokens (N, G) that each frame of standardised motion (N, C) has as a keyframe."""
     quantizer = model.tokenizer.quantizer
     return torch.cat([quantizer.codebook.indices(quantizer.encode(m[None]))[0] + 1 for m in torch.split(motion, 4096)])
 
@@ -271,24 +271,24 @@ def window_tokens(model: SfmsModel, motion: Tensor, dense: Tensor, starts: Tenso
     """
     tokenizer = model.tokenizer
     mask = tokenizer.place(windows(motion, starts, tokenizer.window))
-    if tokenizer.strategy == "penalised":  # a window begins where the last keyframe is held
+    if tokenizer.strategy == "penalised":  # a window's first frame holds the last keyframe
         mask[:, 0] = 1.0
     return torch.where(mask > 0.5, windows(dense, starts, tokenizer.window), 0)
 
 
 def held_tokens(tokens: Tensor, lengths: Sequence[int]) -> Tensor:
-    """Return the last keyframe (N, G) at or before each frame of its dyad, 0 for none, of tokens (N, G) of dyads."""
+    """Return the last keyframe (N, G) at or before each frame of its dyad, 0 if none, of tokens (N, G) of dyads."""
     return torch.cat([last_keyframes(one[None]).tokens[0, ..., 0] for one in torch.split(tokens, list(lengths))])
 
 
-# --- Keyframes that a roll-out misses, and that training therefore has to miss now and then -----------------------
+# --- Keyframes that are left out in training, because a roll-out misses some too ----------------------------------
 #
-# Teacher forcing never shows the predictor a face that should have come back and has not: a lid whose opening was not
-# drawn, a nod that has lost its last swing. In a roll-out that happens, and such a face would stay until some later
-# keyframe. So the last keyframes before the first frame to draw are left out now and then, and where what is then shown
-# is off by more than a keyframe costs, the right answer is one at once: the face as it is there.
+# Teacher forcing never shows the predictor a face that should have returned and has not: a lid whose opening was not
+# drawn, a nod that has lost its last swing. In a roll-out this happens, and such a face would stay until some later
+# keyframe. So the last keyframes before the first frame to draw are sometimes left out. If the face is then wrong by
+# more than the cost of a keyframe, the target is a keyframe at once: the true face of that frame.
 
-MISSED_FRAMES = 6  # before the first to draw
+MISSED_FRAMES = 6  # frames before the first frame to draw
 
 
 def without_last_keyframes(
@@ -301,10 +301,10 @@ def without_last_keyframes(
     share: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Return tokens (B, T, G): a `share` of groups has missed its last keyframes and is put right in frame `first`.
+    """Return tokens (B, T, G): a `share` of groups lacks its last keyframes and is corrected in frame `first`.
 
     Args:
-        tokens: what was meant; dense: (B, T, G) what each frame's keyframe would be.
+        tokens: true tokens; dense: (B, T, G) tokens that each frame has as a keyframe.
         motion: (B, T, C) standardised; member: (G, C); costs: (G,) of a keyframe, in squared units of the motion.
         first: (B,) the first frame to draw, above 0.
         generator: on the device of the tokens.

@@ -51,7 +51,7 @@ def train_listener(
 
     Sampling is calibrated afterwards, by roll-outs (`train_runs.calibrate`).
 
-    `order`: of `features.corpora`.
+    `order`: see `features.corpora`.
 
     Returns the figures of the run. Ctrl-C leaves a checkpoint in `out`, from which `run.resume` continues; the weights
     are written when the run is finished.
@@ -96,7 +96,7 @@ def listener_job(
         if phase.event_windows and len(eventful):
             busy = uniform(generator, batch) < phase.event_windows
             chosen = torch.where(busy, eventful[torch.randint(len(eventful), (batch,), generator=generator)], chosen)
-        # Microphones differ.
+        # Vary the level, since microphones differ.
         louder = (uniform(generator, batch) * 2 - 1) * phase.gain_db * LN_PER_DB if listener.audio == "mel" else None
         chosen = chosen.to(device, non_blocking=True)
         noise = noise_of(generator, device)
@@ -131,7 +131,7 @@ def listener_job(
 
 
 class Lessons:
-    """Windows of a corpus as the predictor learns them: what is seen in one, and the tokens that come next.
+    """Windows of a corpus for the predictor to learn: the inputs of each, and the tokens that come next.
 
     Attributes:
         starts: first frames of all windows.
@@ -140,7 +140,7 @@ class Lessons:
     """
 
     def __init__(self, model: SfmsModel, corpus: SfmsCorpus, placed: TokensOf = "dyads") -> None:
-        """Tokenise a corpus. `placed`: `PredictorTraining.tokens`."""
+        """Tokenise a corpus. `placed`: see `PredictorTraining.tokens`."""
         settings = model.settings
         self.model, self._corpus = model, corpus
         self.starts = corpus.starts(settings.window_frames)
@@ -163,7 +163,7 @@ class Lessons:
         return context(self.model, self._corpus, own, starts, louder, self._held), own[:, settings.past_frames :]
 
     def some(self, generator: Generator) -> Iterator[tuple[Context[Tensor], Tensor]]:
-        """Yield batches of `at` for windows that are drawn."""
+        """Yield batches of `at` for windows drawn at random."""
         for _ in range(HELD_OUT_BATCHES):
             yield self.at(self.starts[torch.randint(len(self.starts), (HELD_OUT_BATCH,), generator=generator)])
 
@@ -175,7 +175,7 @@ def starts_with_events(corpus: SfmsCorpus, starts: Tensor, listener: config.Sfms
 
 
 def corrected(settings: config.Training) -> config.Sfms:
-    """Return the listener with the weight of class 0 in (14) taken out of its probability (p' ~ w p), if configured."""
+    """Return the listener with the weight of class 0 in (14) removed from its probability (p' ~ w p), if configured."""
     if not settings.predictor.undo_weight:
         return settings.listener
     bias = -math.log(settings.predictor.transition_weight)
@@ -187,10 +187,10 @@ def corrected(settings: config.Training) -> config.Sfms:
 
 
 def _drawn(listener: config.Sfms, target: Tensor, generator: Generator) -> Tensor:
-    """Draw how many frames (B, 1), on the CPU, of each future (B, H, G) are drawn already when the rest is planned.
+    """Draw the number (B, 1), on the CPU, of frames of each future (B, H, G) that are fixed when the rest is planned.
 
-    None of them is the paper's training, and that of a listener whose hop is a whole plan: nothing is ever left of the
-    one before. A stream of hop 4 plans with 4 of them drawn.
+    It is 0 in the paper's training, and for a listener whose hop is a whole plan, since nothing of the plan before is
+    left. A stream of hop 4 plans with 4 frames fixed.
     """
     b, h, _ = target.shape
     return torch.randint(h if listener.hop_frames < h else 1, (b, 1), generator=generator)
@@ -199,8 +199,9 @@ def _drawn(listener: config.Sfms, target: Tensor, generator: Generator) -> Tenso
 def _loss(
     model: SfmsModel, seen: Context[Tensor], meant: Tensor, count: Tensor, phase: config.PredictorTraining
 ) -> Tensor:
-    """Return cross-entropy (14) and soft-DTW on the future after `count` (B, 1) frames, of the CPU, drawn already.
+    """Return cross-entropy (14) and soft-DTW on the future after its first `count` frames, which are fixed.
 
+    `count` (B, 1) is on the CPU.
     `meant` (B, P + H, G): tokens of the past, in place of those in `seen`, and of the future.
     """
     h = model.settings.future_frames
@@ -228,14 +229,14 @@ def augment(
 ) -> Context[Tensor]:
     """Return contexts with missing modalities, a cold start and a noisy past. `neutral` (P, G).
 
-    All of it and the generator are on one device (`learning.job.noise_of`).
+    All tensors and the generator are on one device (`learning.job.noise_of`).
     """
     b, p = seen.heard.shape
     device = seen.tokens.device
     heard = seen.heard & (uniform(generator, b, 1) >= training.drop_audio)
     known = seen.face_known & (uniform(generator, b, 1) >= training.drop_face)
     past = perturb(seen.tokens[:, :p], grid, training.history_noise, generator)
-    # Neutral prefix (IV-C): the first frames are as a stream begins, with nothing heard or seen.
+    # Neutral prefix (IV-C): the first frames are like the start of a stream, without sound or face.
     cold = uniform(generator, b, 1) < training.neutral_prefix
     cut = torch.randint(1, p + 1, (b, 1), generator=generator, device=device)
     frame = torch.arange(p, device=device)
@@ -249,9 +250,9 @@ def augment(
 
 
 def perturb(tokens: Tensor, grid: Grid | None, share: float, generator: Generator) -> Tensor:
-    """Move a share of the keyframes by one level in one dimension: in a roll-out the past is the model's own.
+    """Move a share of the keyframes by one level in one dimension, since in a roll-out the past is the model's own.
 
-    Without a grid (vq) no code is next to another: there those keyframes are left out, which a roll-out does as well.
+    Without a grid (vq) codes have no neighbours: these keyframes are left out instead, which a roll-out does too.
     """
     if not is_drawn(generator, share):
         return tokens
@@ -269,7 +270,7 @@ def perturb(tokens: Tensor, grid: Grid | None, share: float, generator: Generato
 
 @torch.no_grad()
 def held_out_loss(lessons: Lessons, phase: config.PredictorTraining) -> float:
-    """Return the loss, not augmented, on windows drawn with a fixed seed."""
+    """Return the loss without augmentation on windows drawn with a fixed seed."""
     model = lessons.model.eval()
     generator = Generator().manual_seed(0)
     losses = []
@@ -281,9 +282,9 @@ def held_out_loss(lessons: Lessons, phase: config.PredictorTraining) -> float:
 
 @torch.no_grad()
 def keyframe_scores(model: SfmsModel, corpus: SfmsCorpus, placed: TokensOf = "dyads") -> dict[str, float]:
-    """Return recall and precision of keyframes, teacher-forced: a frame counts as one where that is likelier than not.
+    """Return recall and precision of keyframes, teacher-forced: a frame counts as one if its probability is above half.
 
-    All groups and future frames pooled, on windows drawn with a fixed seed. `placed`: `PredictorTraining.tokens`.
+    All groups and future frames are pooled, on windows drawn with a fixed seed. `placed`: `PredictorTraining.tokens`.
     """
     model.eval()
     hit = said = true = 0
@@ -308,7 +309,7 @@ def next_tokens(
     Args:
         logits: per group (B, H, V_g + 1).
         target: (B, H, G) classes.
-        counted: (B, H) bool: frames that were to be predicted; of the CPU, or else the host waits for their number.
+        counted: (B, H) bool: frames that are to be predicted; on the CPU, or else the host waits for their number.
     """
     total = target.new_zeros((), dtype=torch.float32)
     rows = counted.flatten().nonzero()[:, 0].to(target.device, non_blocking=True)
@@ -322,21 +323,21 @@ def next_tokens(
 
 # --- Soft dynamic time warping (Cuturi and Blondel, ICML 2017): a DTW whose minima are soft, so that it has a gradient
 #
-# The predictor's loss takes it on the keyframe indicator (IV-D3, "binary soft dynamic time warping"): a keyframe that
-# is expected one frame late costs less than one that is not expected at all. The paper gives neither smoothing nor
+# The predictor's loss applies it to the keyframe indicator (IV-D3, "binary soft dynamic time warping"): a keyframe that
+# is expected one frame late costs less than one that is not expected at all. The paper states neither smoothing nor
 # weight.
 
 
 def soft_dtw(cost: Tensor, gamma: float) -> Tensor:
     """Return the least summed cost (B,) of a path through cost (B, T, U), from corner to corner, with soft minima.
 
-    Steps (1, 0), (0, 1), (1, 1), full window. As `gamma` goes to 0 it becomes DTW; above 0 it lies below it. The paths
-    are summed along anti-diagonals, so that the batch and each diagonal go at once.
+    Steps (1, 0), (0, 1), (1, 1), full window. As `gamma` goes to 0 the result becomes that of DTW; above 0 it is lower.
+    The paths are summed along anti-diagonals, so that each diagonal of the whole batch is computed at once.
     """
     if gamma <= 0:
         raise ValueError(f"gamma {gamma:g} must be above 0")
     b, rows, columns = cost.shape
-    # One frame of infinity around the path sums; diagonal d holds cells (i, d - i) by i, shifted by that frame.
+    # The path sums have a border of infinity; diagonal d holds cells (i, d - i) by i, shifted by that border.
     far = torch.full((b, rows + 1), torch.inf, dtype=cost.dtype, device=cost.device)
     before, last = far, far
     row = torch.arange(rows, device=cost.device)

@@ -1,4 +1,4 @@
-"""Phase 1 (IV-D): keyframe scores, quantizer and inpainter, trained together by what they reconstruct."""
+"""Phase 1 (IV-D): keyframe scores, quantizer and inpainter, trained together on their reconstruction."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ def train_tokenizer(
     run: Run = ALONE,
     order: Order | None = None,
 ) -> dict[str, Any]:
-    """Train on `data`/train and write `out`/tokenizer.safetensors; its predictor is as good as new.
+    """Train on `data`/train and write `out`/tokenizer.safetensors; the predictor in it is untrained.
 
-    `order`: of `features.corpora`.
+    `order`: see `features.corpora`.
 
     Returns the figures of the run and the held-out error. Ctrl-C leaves a checkpoint in `out`, from which
     `run.resume` continues; the weights are written when the run is finished.
@@ -100,7 +100,7 @@ def optimizers_of(tokenizer: Tokenizer, phase: config.TokenizerTraining) -> list
 def amplified(batch: Tensor, gain: float, generator: Generator) -> Tensor:
     """Scale the motion of windows (B, T, C), all channels alike; `gain`: deviation of the logarithm of the factor.
 
-    A few faces do not hold what the next face does at its widest. The best masks stay the best.
+    The few faces of the data lack the widest movements of other faces. The best masks stay the best.
     """
     if not gain:
         return batch
@@ -111,9 +111,9 @@ def amplified(batch: Tensor, gain: float, generator: Generator) -> Tensor:
 def loss_of_steps(
     tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], phase: config.TokenizerTraining, gain: float = 0.0
 ) -> LossOf:
-    """Return the loss of a step on standardised motion (N, C) of dyads of these lengths, by the placement of keyframes.
+    """Return the loss of a step on standardised motion (N, C) of dyads of these lengths, for the strategy of placement.
 
-    `gain`: of `amplified` windows.
+    `gain`: of `amplified`.
     """
     score = tokenizer.score
     if isinstance(score, ScoreNetwork):
@@ -164,9 +164,9 @@ def reconstruction(
 ) -> Tensor:
     """Return L2 + the first part of L2^Q of (13), and, beyond the paper, `velocity` times the error of the steps.
 
-    The velocity term keeps movement between coarse codes from having corners. ||z^kf - z^kf^|| is taken in motion
-    space: the error of the codes alone, at the keyframes. The stop-gradient terms of L2^Q are the codebook's
-    (`Grid.commitment`, `Codebook.commitment`), since only it knows whether anything can move.
+    The velocity term smooths the corners of movement between coarse codes. ||z^kf - z^kf^|| is taken in motion
+    space: the error of the codes alone, at the keyframes. The stop-gradient terms of L2^Q are computed by the
+    codebook (`Grid.commitment`, `Codebook.commitment`), since they depend on whether its codes can move.
 
     Args:
         motion, restored, at_keyframes: (B, T, C); the last decoded from each frame's own code.
@@ -187,7 +187,7 @@ def tokenizer_loss(
 ) -> tuple[Tensor, Tensor]:
     """Return loss (13) without its masking term, and the squared error of each window (B,).
 
-    A learned codebook has no gradient and is moved here.
+    A learned codebook has no gradient and is updated here.
     """
     quantizer = tokenizer.quantizer
     latent = quantizer.latent(batch)
@@ -208,7 +208,7 @@ def held_out_windows(model: SfmsModel, corpus: SfmsCorpus) -> Tensor:
 
 
 def _held_out(model: SfmsModel, corpus: SfmsCorpus) -> Callable[[], float]:
-    """Return the held-out error: with the masks that training uses, placed once where that is slow."""
+    """Return a function that computes the held-out error with the masks of training, placed once if that is slow."""
     tokenizer = model.tokenizer
     if not isinstance(tokenizer.score, ConditionalScore) and tokenizer.strategy != "penalised":
         return lambda: reconstruction_error(model, corpus)
@@ -229,37 +229,38 @@ def window_errors(tokenizer: Tokenizer, motion: Tensor, mask: Tensor) -> Tensor:
 
 @torch.no_grad()
 def reconstruction_error(model: SfmsModel, corpus: SfmsCorpus, strategy: Strategy | None = None) -> float:
-    """Return the mean squared error on consecutive windows, in standardised units, perhaps with another placement."""
+    """Return the mean squared error on consecutive windows, in standardised units; `strategy`: another placement."""
     tokenizer = model.tokenizer
     motion = held_out_windows(model, corpus)
     masks = [tokenizer.place(some, tokenizer.keyframes, strategy) for some in torch.split(motion, CHUNK)]
     return float(window_errors(tokenizer, motion, torch.cat(masks)).mean())
 
 
-# --- What conditional keyframe scores learn from: a teacher that knows how every choice would end -----------------
+# --- Training of conditional keyframe scores: a teacher computes the final error of every choice ------------------
 #
-# The score network chooses keyframes for some tracks by itself, now and then by chance, and at each state it came
-# through the teacher says, for every frame, the error of the best mask of k keyframes that holds what is chosen and
-# this frame (`piecewise_linear.completion_errors`). The scores learn to prefer what costs least in the end. Because the
-# states are the network's own, it learns to get out of its own mistakes.
+# The score network chooses the keyframes of some tracks, partly at random. At each state that it passes, the teacher
+# computes for every frame the error of the best mask of k keyframes that contains the chosen frames and this frame
+# (`piecewise_linear.completion_errors`). The scores learn to prefer the frames with the least final error. Because the
+# states are the network's own, it learns to recover from its own mistakes.
 #
-# Why not equation (13) alone: through Algorithm 1 a score hears only of the draw it took part in, and the loss stalls
-# above evenly placed keyframes. The teacher's error is that of linear interpolation, which the inpainter starts from.
+# Equation (13) alone is not enough: through Algorithm 1 a score learns only from the draw it took part in, and the loss
+# stalls above that of evenly placed keyframes. The teacher's error is that of linear interpolation, from which the
+# inpainter starts.
 #
-# Error of linear interpolation over that of the exact masks, recorded faces, unseen takes, one set of keyframes per
-# channel, k = 3, 7, 10: even keyframes 4.3, 11, 15; choices of this network 1.7, 2.0, 1.6; swept over twice 1.16, 1.23,
+# Error of linear interpolation relative to the exact masks, on recorded faces (unseen takes), one set of keyframes per
+# channel, k = 3, 7, 10: even keyframes 4.3, 11, 15; choices of this network 1.7, 2.0, 1.6; after two sweeps 1.16, 1.23,
 # 1.13 (width 32, 2 layers, 1,500 steps of 32 tracks).
 
-FLOOR = 0.05  # added to the least error, in squared deviations of the track: below it nobody sees a difference
+FLOOR = 0.05  # added to the least error, in squared deviations of the track; smaller differences are not visible
 SHARPNESS = 0.1  # temperature of the teacher's preferences
-CANDIDATES = 4  # tracks looked at for one that is learned from
-EXPLORED = 0.5  # share of choices that are drawn rather than the highest score
+CANDIDATES = 4  # candidate tracks for each track that is learned from
+EXPLORED = 0.5  # share of choices that are drawn at random instead of by the highest score
 
 
 def imitation(score: ConditionalScore, track: Tracks, most: int, generator: Generator) -> Tensor:
-    """Return the cross-entropy of scores and teacher over all states of one choice of 1..`most` keyframes a track."""
+    """Return the cross-entropy of scores and teacher over all states of choosing 1..`most` keyframes per track."""
     n = len(track.curves)
-    k = torch.randint(1, most + 1, (n,), generator=generator)  # on the CPU: as many states follow
+    k = torch.randint(1, most + 1, (n,), generator=generator)  # on the CPU, since it sets the number of states
     rows, chosen, remaining = states(score, track, k, noise_of(generator, track.curves.device))
     regret = regrets(track[rows], chosen, k.to(rows.device, non_blocking=True)[rows], most)
     wanted = torch.softmax(-regret / SHARPNESS, dim=1)
@@ -270,7 +271,7 @@ def imitation(score: ConditionalScore, track: Tracks, most: int, generator: Gene
 
 @torch.no_grad()
 def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: Generator) -> Tracks:
-    """Draw at most `count` tracks of motion (B, T, C), lively ones more often: a still one has no best keyframes."""
+    """Draw at most `count` tracks of motion (B, T, C), lively ones more often: still ones have no best keyframes."""
     few = -(-CANDIDATES * count // len(member))  # windows that give enough candidates
     some = motion[torch.randperm(len(motion), generator=generator)[:few].to(motion.device, non_blocking=True)]
     found = tracks(some, member, curves)
@@ -285,7 +286,7 @@ def lively(motion: Tensor, member: Tensor, curves: int, count: int, generator: G
 def states(score: ConditionalScore, track: Tracks, k: Tensor, generator: Generator) -> tuple[Tensor, Tensor, Tensor]:
     """Return all states (track row, chosen frames (S, T), keyframes to come) that the choices of the network reach.
 
-    `k` (n,) keyframes of each track, of the CPU; the generator is on the device of the tracks.
+    `k` (n,): number of keyframes of each track, on the CPU. The generator is on the device of the tracks.
     """
     n, t, _ = track.curves.shape
     mask = track.curves.new_zeros(n, t)
@@ -306,8 +307,9 @@ def states(score: ConditionalScore, track: Tracks, k: Tensor, generator: Generat
 
 @torch.no_grad()
 def regrets(track: Tracks, chosen: Tensor, k: Tensor, most: int) -> Tensor:
-    """Return the excess error of each next frame (S, T) over the best one with all k keyframes, as a share of the
-    least.
+    """Return the error with all k keyframes of each next frame (S, T), in excess of the best next frame's.
+
+    It is a share of the least error; infinite for frames that are already chosen.
     """
     errors = completion_errors(track.cost, chosen, most)  # (S, most, T)
     errors = errors[torch.arange(len(k), device=k.device), k - 1]
@@ -315,13 +317,13 @@ def regrets(track: Tracks, chosen: Tensor, k: Tensor, most: int) -> Tensor:
     return ((errors - least) / (least + FLOOR)).masked_fill(chosen > 0.5, torch.inf)
 
 
-# --- Keyframe masks for training: fresh for every batch, or, where that is slow, from a bank placed beforehand ----
+# --- Keyframe masks for training: placed for every batch, or, if that is slow, taken from a bank placed before ----
 #
-# Conditional scores (`learned`) learn from the exact masks, and so do the codes and the inpainter beside them: their
-# own masks differ little from their teacher's once they are learned, and need not be placed again each step.
+# Conditional scores (`learned`) are trained on the exact masks, and so are the codes and the inpainter: once the scores
+# are learned, their masks differ little from their teacher's, and need not be placed again at each step.
 
-FEW_GROUPS = 8  # up to so many, exact masks of a batch take less time than its step
-MOST_WINDOWS = 2000  # of which masks are kept; more overlap than that teaches little
+FEW_GROUPS = 8  # up to this number, exact masks of a batch take less time than its step
+MOST_WINDOWS = 2000  # windows whose masks are kept; windows that overlap more teach little
 
 Batch = Callable[[int, Generator], tuple[Tensor, Tensor]]  # batch size -> motion (B, T, C), masks (B, T, G)
 
@@ -334,12 +336,12 @@ def teacher(strategy: Strategy) -> Strategy:
 @torch.no_grad()
 def _masks(tokenizer: Tokenizer, batch: Tensor) -> Tensor:
     """Return the masks (B, T, G) of windows by the teacher's placement."""
-    count = None if tokenizer.strategy == "exact" else tokenizer.keyframes  # gaps have no bound where a count is given
+    count = None if tokenizer.strategy == "exact" else tokenizer.keyframes  # with a given count, gaps are not bounded
     return tokenizer.place(batch, count, teacher(tokenizer.strategy))
 
 
 def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn: int) -> Batch:
-    """Return the draw of every training step: windows of the standardised motion (N, C) with their masks.
+    """Return the function that draws a batch: windows of the standardised motion (N, C) with their masks.
 
     `lengths` are those of the dyads in `motion`, `drawn` the number of windows over the whole training.
     """
@@ -360,10 +362,10 @@ def batches(tokenizer: Tokenizer, motion: Tensor, lengths: Sequence[int], drawn:
         if whole is None:
             return batch, _masks(tokenizer, batch)
         mask = windows(whole, starts[chosen], window)
-        if strategy == "penalised":  # a window is a piece of its dyad, and begins where the last keyframe is held
+        if strategy == "penalised":  # a window is cut from its dyad; its first frame holds the last keyframe
             mask[:, 0] = 1.0
             return batch, mask
-        # A tokenizer that places exactly at run time sees half its masks from long stretches, as the predictor will.
+        # A tokenizer with exact placement at run time gets half its masks from long stretches, as the predictor will.
         return batch, torch.cat([mask[: size // 2], _masks(tokenizer, batch[size // 2 :])])
 
     return draw
