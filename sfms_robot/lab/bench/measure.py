@@ -139,8 +139,8 @@ def compare_installations(name: str, against: Path) -> Rows:
                 capture_output=True, text=True, check=False, env=env,
                 cwd=tempfile.gettempdir(),  # child processes import from their current folder first
             )  # fmt: skip
-            if done.returncode:
-                raise ConfigError(f"bench {name}: {(done.stderr or done.stdout).strip().splitlines()[-1]}")
+            if done.returncode > 1 or not done.stdout:  # 1: a figure misses its limit
+                raise ConfigError(f"bench {name}: {(done.stderr.strip().splitlines() or ['?'])[-1]}")
             for key, each in json.loads(done.stdout.splitlines()[-1]).items():
                 if not isinstance(each, dict) or "median" not in each:
                     raise ConfigError(f"--against {against}: 'bench {name}' has no rows to compare")
@@ -161,7 +161,9 @@ def result_of(returncode: int | None, said: str, out: str, name: str) -> Any:
     """Return the JSON in the last line of `out`. Raises BusError with the last error line of a child that failed."""
     lines = out.splitlines()
     if returncode or not lines:
-        raise BusError(f"bench {name}: the run ended with {returncode}: {said.strip().splitlines()[-1:]}")
+        raise BusError(
+            f"bench {name}: the run failed with exit code {returncode}: {(said.strip().splitlines() or ['?'])[-1]}"
+        )
     return json.loads(lines[-1])
 
 

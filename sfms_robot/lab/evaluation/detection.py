@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import starmap
 from typing import Final
 
 import numpy as np
@@ -203,7 +204,7 @@ class DetectorCalibration:
     def on(cls, listeners: Sequence[tuple[Sequence[ListenerEvent], Floats]]) -> DetectorCalibration:
         """Measure on listeners (events, motion); "in time" is relative to the median lateness of each kind."""
         known = [(asked, Detected.of(motion)) for asked, motion in listeners]
-        lag_s = cls(added_up(asked_and_seen(asked, detected) for asked, detected in known)).lag_s
+        lag_s = cls(added_up(starmap(asked_and_seen, known))).lag_s
         return cls(added_up(asked_and_seen(asked, detected, lag_s) for asked, detected in known))
 
     @property

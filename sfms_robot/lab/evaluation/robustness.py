@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import starmap
 from pathlib import Path
 from statistics import median
 from typing import Final, Literal
@@ -187,7 +188,7 @@ def _kept(voices: Folders, split: Split) -> tuple[UnseenSpeaker, ...]:
         face = speaker_motion(mouth, motions, rng, attention=np.ones(len(mouth), np.float32))
         return UnseenSpeaker(name, recording[: len(mouth) * FRAME_SAMPLES], face)
 
-    return tuple(speaker(number, name) for number, name in enumerate(sorted(kept)))
+    return tuple(starmap(speaker, enumerate(sorted(kept))))
 
 
 # --- conditions -----------------------------------------------------------------------------------------------------

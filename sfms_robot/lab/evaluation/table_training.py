@@ -184,7 +184,7 @@ def snapshots(tokenizer: Tokenizer | DenseTokenizer, watched: Tensor, step: int)
     else:  # scores of the first choice only
         track = tracks(watched, tokenizer.member, score.curves)
         w, t, _ = watched.shape
-        counts = torch.tensor(tokenizer.keyframes).repeat(w)
+        counts = torch.tensor(tokenizer.keyframes, device=watched.device).repeat(w)
         logits = torch.log_softmax(score(track, watched.new_zeros(len(counts), t), counts), dim=1)
         scores = logits.view(w, len(tokenizer.keyframes), t).transpose(1, 2)
     errors = (tokenizer.decode(tokenizer.encode(watched, mask)) - watched).square().mean(-1)

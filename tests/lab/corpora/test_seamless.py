@@ -42,7 +42,6 @@ def rows_of(root, name, key):
         return held[key]
 
 
-# --- laws -------------------------------------------------------------------------------------------------------
 def test_partners_swapped_give_the_swapped_dyad(tmp_path):
     write.seamless(tmp_path, interactions=1)
     one, two = open_dataset(tmp_path, "train")

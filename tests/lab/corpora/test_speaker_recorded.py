@@ -24,7 +24,7 @@ def katie():
 
 @pytest.fixture
 def clips(tmp_path):
-    """A clip of training with a laugh at 1 s and one that is spoken into at 5 s, and one of test with a puff."""
+    """A clip of training with laughs at 1 s, at 5 s (spoken into) and after its end, and one of test with a puff."""
     rng = np.random.default_rng(0)
     for name in ("audio_EN2001a_0-30s", "audio_EN2005a_0-30s"):
         soundfile.write(tmp_path / f"{name}.wav", rng.normal(0, 0.1, 8 * AUDIO_HZ), AUDIO_HZ)
@@ -32,6 +32,7 @@ def clips(tmp_path):
         ("audio_EN2001a_0-30s.wav", 1.0, 1.8, "vocalsound", "laugh"),
         ("audio_EN2001a_0-30s.wav", 5.0, 6.0, "vocalsound", "laugh"),
         ("audio_EN2001a_0-30s.wav", 5.5, 5.9, "w", "yes"),
+        ("audio_EN2001a_0-30s.wav", 8.0, 9.0, "vocalsound", "laugh"),
         ("audio_EN2005a_0-30s.wav", 2.0, 2.1, "vocalsound", "laugh"),
     ]
     with gzip.open(tmp_path / "words.csv.gz", "wt", newline="") as file:

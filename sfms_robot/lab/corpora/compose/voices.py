@@ -91,7 +91,8 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
     """
     found: list[tuple[Split, Floats]] = []
     for folder in folders:
-        rows = columns(folder / "words.csv.gz") if (folder / "words.csv.gz").is_file() else {}
+        file = folder / "words.csv.gz"
+        rows = columns(file) if file.is_file() else {}
         if not {"clip", "start_s", "end_s", "kind", "text"} <= rows.keys():
             continue
         starts_s, ends_s = (map(float, rows[name]) for name in ("start_s", "end_s"))
@@ -100,8 +101,9 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
             spoken_into = any(c == clip and kind == "w" and a < end and b > start for c, a, b, kind, _ in said)
             if text == "laugh" and end - start >= _LAUGH_S and not spoken_into and (folder / clip).is_file():
                 audio = read_audio(folder / clip)[int(start * AUDIO_HZ) : int(end * AUDIO_HZ)]
-                levelled = np.clip(audio * (_LEVEL / np.sqrt(np.mean(audio**2))), -1, 1)
-                found.append((split_of_voice(Path(clip).stem), _eased(levelled)))
+                if audio.any():  # a laugh after the end of its clip is empty
+                    gain = _LEVEL / np.sqrt(np.mean(audio**2))
+                    found.append((split_of_voice(Path(clip).stem), _eased(np.clip(audio * gain, -1, 1))))
     return by_split(found)
 
 
