@@ -84,8 +84,8 @@ def listen(flag: str, host: str, port: int, others: int = 0) -> socket.socket:
 
 def leads_here(address: str, port: int) -> bool:
     """Return whether HOST:PORT is this machine at `port`. Sends no query to a name server."""
-    host, at = host_and_port(address) or ("", 0)
-    name = socket.gethostname()
+    host, at = host_and_port(address.lower()) or ("", 0)
+    name = socket.gethostname().lower()
     named = host in ("localhost", name, f"{name}.local", "0.0.0.0", "::", *addresses_of_this_machine())
     return at == port and (named or is_loopback(host))
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from sfms_robot.data import data_dir
-from sfms_robot.endpoint import LOOPBACK, port_number
+from sfms_robot.endpoint import LOOPBACK, host_and_port
 from sfms_robot.errors import ConfigError
 
 RATE_HZ: Final = 60.0
@@ -101,11 +101,10 @@ class EmulatedPhone:
 def main(arguments: Sequence[str]) -> None:
     """Send to `[HOST:]PORT` until interrupted. Raises ConfigError."""
     target = arguments[0] if arguments else str(PORT)
-    host, _, number = target.rpartition(":")
-    port = port_number(number, least=1)
-    if port is None:
+    place = host_and_port(target, least=1)
+    if place is None:
         raise ConfigError(f"{target!r} is not an address to send to (PORT, HOST:PORT)")
-    phone = EmulatedPhone(host or LOOPBACK, port)
+    phone = EmulatedPhone(*place)
     try:
         phone.play()
     finally:
@@ -117,5 +116,5 @@ if __name__ == "__main__":
         main(sys.argv[1:])
     except KeyboardInterrupt:
         pass
-    except ConfigError as problem:
+    except (ConfigError, OSError) as problem:
         sys.exit(str(problem))

@@ -220,9 +220,8 @@ class CompositeBus:
     def stop(self, policy: StopPolicy, within_s: float = STOP_S) -> None:
         """Send torque off on all buses without waiting for their writers; then let each bus confirm it.
 
-        If a writer does not end, the other buses confirm at the same time, in threads. Otherwise all buses confirm one
-        after the other, each in its share of the time. Never raises; blocks `within_s` at most, with threads also if a
-        bus hangs in a system call.
+        In real time the buses confirm at the same time, in threads; in virtual time one after the other, each in its
+        share of the time. Never raises; blocks `within_s` at most, in real time also if a bus hangs in a system call.
         """
         began_s = time.monotonic()
         for writer in self._writers.values():
@@ -231,7 +230,7 @@ class CompositeBus:
         free = {name: self._buses[name] for name in self._buses if self._ended(name, began_s + _TICK_S)}
         for thread in self._stops:  # left from an interrupted call of `stop`: only one thread may use a bus
             thread.join(max(0.0, began_s + within_s - time.monotonic()))
-        if self._rates_hz is None or not self._writers:
+        if self._rates_hz is None:
             for bus in free.values():
                 bus.stop(policy, (within_s - _TICK_S) / len(free))
             return

@@ -271,7 +271,7 @@ class Microphone:
         self._logged = Said()
         self._said: dict[int, Floats | None] = {}
         self._speed_rad_s = self._sent_speed_rad_s = 0.0
-        self._collect(0.0, 0)
+        self._collect(time.monotonic(), 0)
 
     @property
     def lost(self) -> bool:

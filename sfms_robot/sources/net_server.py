@@ -87,9 +87,8 @@ class NetServer(ServerThread):
 
     def post(self, work: Callable[[], None]) -> None:
         """Call `work` in the server's thread, soon. Too many waiting calls drop the oldest. Never blocks."""
-        idle = not self._posted
         self._posted.append(work)
-        if idle:
+        if len(self._posted) == 1:  # measured after it was added: `_work` may just have emptied the queue
             with suppress(RuntimeError):  # closed
                 self._loop.call_soon_threadsafe(self._work)
 

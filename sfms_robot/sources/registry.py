@@ -178,10 +178,10 @@ def _opened(failed: ExitStack, flag: str, value: str, **more: Any) -> Any:
     if kind is None:
         return None
     part = plug_in(kind, argument, more[name]) if name in more else plug_in(kind, argument)
-    failed.callback(part.close)
     if not any(hasattr(part, method) for method in _PARTS[flag]):
         wanted = " or ".join(_PARTS[flag].values())
         raise ConfigError(f"{flag} {name}: {kind.value} gave a {type(part).__name__}, no {wanted}")
+    failed.callback(part.close)
     return part
 
 

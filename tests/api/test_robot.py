@@ -176,7 +176,6 @@ def test_hear_with_another_source_raises():
             push(np.zeros(640), 16000)
 
 
-# --- servos alone ---
 def test_servos_alone_go_where_they_are_told_within_the_limits_and_rest_at_the_end():
     rng = np.random.default_rng(0)
     with sr.open_bus(HEAD) as bus:
@@ -261,7 +260,6 @@ def test_torque_that_is_not_confirmed_off_is_raised_by_the_end_and_in_the_report
         assert [servo.id for servo in servos if chain.state(servo.id)["torque"]] == [servos[0].id]
 
 
-# --- speech that is played ---
 def until(robot, state):
     for _ in range(round(LIMIT_S / LOOK_S)):
         if robot.state == state:

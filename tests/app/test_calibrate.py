@@ -262,7 +262,6 @@ def test_a_stored_value_that_stops_a_joint_names_the_command_with_the_arguments_
     assert f"; sfms-robot doctor --port {chain.device} --head {shlex.quote(name)} --fix" in outcome.skipped["jaw"]
 
 
-# --- what a run makes of it -------------------------------------------------------------------------------------
 def ready_on(name: str, port: str) -> Head:
     kept: dict[str, Port] = {}
     ready = calibrated_head(name, port, RealClock(), kept)
@@ -310,7 +309,6 @@ def test_a_run_takes_measured_joints_as_they_are_and_holds_the_others_back(name,
     assert "not calibrated in brow" in caplog.text
 
 
-# --- what a start refuses, and `doctor --fix` records -----------------------------------------------------------
 @pytest.fixture
 def turret(tmp_path, monkeypatch) -> Path:
     """A copy of a shipped head, and a folder for what belongs to this build."""

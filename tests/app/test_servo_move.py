@@ -192,7 +192,6 @@ def test_after_an_interrupt_torque_is_off_or_named(more, ends):
     assert ends is KeyboardInterrupt or str(ended.value).startswith("torque of id 1 could not be confirmed off")
 
 
-# --- release ----------------------------------------------------------------------------------------------------
 def left_by_a_killed_run(head, chains, clock):
     """Torque on, ports closed, nothing switched off."""
     bus = build_bus(head, chains, clock, confirmed=True)

@@ -149,7 +149,6 @@ def test_a_mistake_in_the_overlay_is_named_with_its_file(change, message):
     assert str(file) in str(caught.value)
 
 
-# --- what servos have stored ------------------------------------------------------------------------------------
 def copied(folder, *changes):
     """A head of the user's own: a shipped one, some words of its file changed."""
     text = (find("heads", "interbotix_wxxms", "head.yaml") / "head.yaml").read_text()

@@ -150,7 +150,6 @@ def more_said(running, chain, count=TICKS_20):
     running.until(lambda: said(chain) > before + count)
 
 
-# --- phases of a run, told by what is seen from outside; each returns while the phase lasts -------------------------
 def loading(running, chain):
     """The listener loads, in a process of its own."""
     running.until(running.children)

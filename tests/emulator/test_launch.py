@@ -184,7 +184,6 @@ def test_what_cannot_be_is_refused_in_one_line(servos, how, message):
     assert "\n" not in str(caught.value)
 
 
-# --- the end of the process -------------------------------------------------------------------------------------
 def test_hosts_at_a_tcp_port_share_the_wire_and_lose_nothing_they_wrote():
     with launch([EmulatedServo(1), EmulatedServo(2)], transport="tcp") as chain:
         first, second = (SerialPort(chain.device, BAUD, RealClock()) for _ in range(2))

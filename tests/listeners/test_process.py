@@ -69,7 +69,6 @@ def test_a_probe_measures_plans_and_ends_even_without_time():
     assert max(waits_s) <= FRAME_S  # at the pace of a run
 
 
-# --- the parent and a real child -----------------------------------------------------------------------------------
 def take(listener, now_s=0.0):
     """Take the next message; waits for the child itself, however long that takes on this computer."""
     return listener._take(listener._supervised.child.receive(60.0), now_s)

@@ -162,7 +162,6 @@ def test_random_bytes_to_a_stream_are_not_stepped_but_counted_and_the_first_is_l
     assert f"stream {stream} of 'robot-7'" in line and "only counted" in line
 
 
-# --- admission -------------------------------------------------------------------------------------------------------
 def slow(scale):
     """A millisecond a head and five for any batch, times `scale`."""
     sizes = (1, 2, 4, 8, 16)

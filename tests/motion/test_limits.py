@@ -171,7 +171,6 @@ def test_the_reference_of_a_parabola_is_exact():
     assert difference(*(1 + 2 * t + 3 * t**2), 0.01)[:, 0] == pytest.approx([6, 8, 6])
 
 
-# --- with and without ruckig ------------------------------------------------------------------------------------
 RATES = (3.0, 30.0, 1500.0)  # speed, acceleration, jerk
 ONE = JointLimits(np.array([-2.0]), np.array([2.0]), *(np.array([rate]) for rate in RATES))
 

@@ -86,7 +86,6 @@ def test_a_name_without_an_address_is_reported():
         VmcOutput("no.such.machine.invalid").open()
 
 
-# --- JSON -----------------------------------------------------------------------------------------------------------
 def test_the_object_of_a_frame():
     motion = np.zeros(MOTION_DIM, np.float32)
     motion[:6] = 0.1, 0.2, 0.3, 0.01, 0.02, 0.03

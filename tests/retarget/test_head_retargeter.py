@@ -93,7 +93,6 @@ def test_a_rest_that_is_not_the_necks_home_is_told():
         HeadRetargeter(head.model_copy(update={"joints": {**head.joints, "stewart_2": leg}}))
 
 
-# --- laws of every shipped head ---
 FRAMES = 10_000
 
 

@@ -101,7 +101,6 @@ def test_a_home_outside_the_cranks_ranges_is_told_with_the_angles():
             build_neck(raised, HEAD.joints)
 
 
-# --- the nearest pose within reach, and the body that turns along ---
 FAR = np.array([0.6, 0.6, 1.5, 0.05, 0.05, 0.05])
 LONGEST_STEP = 8.0  # times the step that was asked; a border met at a slant is passed faster than the target moves
 

@@ -148,7 +148,6 @@ def test_products_of_absurd_channels_stay_finite(seed):
     assert np.isfinite(angles).all() and (np.abs(angles) <= np.radians(10)).all()
 
 
-# --- any expression, beside its meaning ---
 def driven(*drives, **joint) -> Head:
     """A head with a joint for each expression, None: one that nothing drives."""
     ends = {"min_deg": -10.0, "rest_deg": 2.0, "max_deg": 30.0}

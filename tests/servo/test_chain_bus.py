@@ -34,6 +34,17 @@ def tick_rad(rig):
     return rig.conversion.rad
 
 
+def test_a_servo_that_lost_its_supply_between_stop_and_enable_is_set_up_again(rig):
+    rig.hold()
+    speed = rig.register(2, "moving_speed")
+    rig.bus.stop("release")
+    rig.servo(2).power_cycle(rig.clock.t)
+    rig.clock.t += 1.0
+    rig.set(2, "moving_speed", speed + 1)
+    rig.bus.enable(rig.bus.joints)
+    assert rig.register(2, "moving_speed") == speed and rig.torques() == [1] * 4
+
+
 def test_families_and_byte_orders_cannot_share_a_bus():
     with pytest.raises(ConfigError, match="scs0009 and sts3215 have present_position at different places or"):
         rig_of(["sts3215", "scs0009"], [2048, 512])

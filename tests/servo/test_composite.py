@@ -175,6 +175,17 @@ def test_torque_off_reaches_every_bus_before_any_is_asked_to_confirm():
     assert [call for call, _ in order] == ["torque_off"] * 3 + ["stop"] * 3
 
 
+def test_stop_does_not_wait_for_a_bus_that_hangs_while_it_confirms():
+    stuck, quick, opened, waited = Steady("stuck"), Steady("quick"), threading.Event(), []
+    stuck.stop = lambda policy, within_s=STOP_S: waited.append(opened.wait(30.0))
+    bus = CompositeBus({"stuck": stuck, "quick": quick}, ["stuck", "quick"], {"stuck": 1000.0, "quick": 1000.0})
+    bus.write(np.zeros(2), 0.0)
+    bus.stop("release", 0.0)
+    assert waited == [] and ("torque_off", "release") in stuck.calls
+    opened.set()
+    bus.close()
+
+
 def test_stop_does_not_wait_for_a_bus_that_hangs_in_the_middle_of_a_write():
     slow, quick = Gate(), Steady("quick")
     offs = []

@@ -116,6 +116,8 @@ ARROWS = [  # how its head is set, what happens, where it is then, the fault it 
     ({"on_fault": "limp"}, [("fails",), ("fails",)], LIMP, "overload"),
     ({"on_fault": "hold"}, [("fails",), ("fails",)], FAULTY, "overload"),
     ({"on_fault": "reduce"}, [("fails",), ("fails",)], REDUCED, "overload"),
+    ({"on_fault": "reduce"}, [("distrust", 0.0), ("run", 0.0), ("fails",)], REJOINING, "overload"),
+    ({"on_fault": "reduce"}, [("distrust", 0.0), ("run", 0.0), ("fails",), ("accepts", STANDS)], REDUCED, "overload"),
     ({"on_fault": "reboot_and_ease_in"}, [("fails",), ("fails",)], REBOOTING, "overload"),
     ({"on_fault": "reboot_and_ease_in"}, [("fails",), ("run", 0.0), ("silent", 0.1)], REBOOTING, "overload"),
     ({"on_fault": "reboot_and_ease_in"}, [("fails",), ("run", 0.0), ("silent", 0.1), ("run", 0.5)], REJOINING, None),

@@ -175,7 +175,6 @@ def test_one_that_would_go_round_the_other_side_is_refused():
     assert not rig.state(1)["torque"]
 
 
-# --- with a bus -------------------------------------------------------------------------------------------------
 STORED = {"min_position_limit": 1300, "max_position_limit": 2800}
 SAGGED = 1200
 

@@ -46,7 +46,6 @@ def test_a_smile_lasts_and_ends_where_it_has_fallen_by_half_and_runs_are_half_op
     assert runs([1, 1, 0, 1]) == [(0, 2), (3, 4)] and runs([]) == []
 
 
-# --- What stands in for scipy.signal, beside it ---------------------------------------------------------------------
 LEVELS = strategies.one_of(strategies.integers(-3, 3).map(float), strategies.floats(-2, 2, width=16))
 
 

@@ -217,7 +217,6 @@ def test_the_clock_is_the_line_under_all_callbacks(ppm, jitter_s, before, seed):
     assert clock.count_at(clock.time_s(1234)) == pytest.approx(1234, abs=0.01)
 
 
-# --- the pace of what is handed over --------------------------------------------------------------------------------
 def problem_of(times_s, piece_s):
     pace = Pace()
     for time_s in times_s:

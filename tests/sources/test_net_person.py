@@ -476,7 +476,6 @@ def test_an_address_that_is_none_is_refused_with_the_choices(place):
         open_source(f"push:{place}")
 
 
-# --- a visitor of the page: one at a time, with its own clock -------------------------------------------------------
 PIECE = np.full(960, 8192, np.int16)  # 20 ms of a quarter of full scale
 
 

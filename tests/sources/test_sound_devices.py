@@ -77,7 +77,6 @@ def test_without_portaudio_its_package_is_named(monkeypatch):
         portaudio(FLAG)
 
 
-# --- blocks ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("first_age_s", "expected_s"),
     [

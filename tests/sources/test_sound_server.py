@@ -183,7 +183,6 @@ def test_a_device_that_is_not_there_is_one_line_with_the_choices(sound_server):
         assert "\n" not in str(raised.value)
 
 
-# --- what the robot says, played ---------------------------------------------------------------------------------
 def noise(seconds):
     return (0.3 * np.random.default_rng(0).uniform(-1, 1, round(seconds * AUDIO_HZ))).astype(np.float32)
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sfms_robot.app.progress import bar
 from sfms_robot.app.serve.batch_process import Served
 from sfms_robot.data import Report
-from sfms_robot.endpoint import HIGHEST_PORT, LOOPBACK, port_number
+from sfms_robot.endpoint import HIGHEST_PORT, host_and_port
 from sfms_robot.errors import ConfigError, ModelError, PacketError, RobotError, optional
 from sfms_robot.frames import FRAME_S
 from sfms_robot.listeners.capacity import Capacity
@@ -312,9 +312,8 @@ def metrics_server(wanted: str) -> LocalServer:
 
     from sfms_robot.viewer.web_server import LocalServer
 
-    host, _, number = wanted.rpartition(":")
-    port = port_number(number)
-    if port is None:
+    place = host_and_port(wanted)
+    if place is None:
         valid = f"0 to {HIGHEST_PORT}, 0 for a free one, HOST:PORT"
         raise ConfigError(f"--metrics {wanted}: not a TCP port (valid: {valid})")
 
@@ -324,7 +323,7 @@ def metrics_server(wanted: str) -> LocalServer:
 
         return [Route("/{path:path}", metrics)]
 
-    server = LocalServer("--metrics", routes, host or LOOPBACK, port)
+    server = LocalServer("--metrics", routes, *place)
     server.url += "metrics"
     return server
 

@@ -37,7 +37,7 @@ def move(seen: FoundServo, to: str | None, by: str | None) -> Row:
     The servo's own profile is limited, and its goal moves in steps of at most `SPEED_DEG_S`. Torque comes on as at
     startup, where the servo stands. Outside its own limits it cannot hold there, and its profile first moves it inside,
     equally slowly. Torque and profile are restored afterwards, also after Ctrl-C. Blocks until the motion is over, and
-    up to `SETTLE_S` more.
+    up to `SETTLE_S` more. Where torque off is not confirmed the profile stays limited.
 
     Raises ConfigError for a goal outside its limits, ServoError for a servo that is not in position mode, refuses, or
     does not reach the goal; it then stops where it is.

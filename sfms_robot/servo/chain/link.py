@@ -281,7 +281,7 @@ def verified_write(
 
     Args:
         lock: the register that opens the EEPROM (0) and closes it (1), for a field behind such a lock. Once it was
-            opened, it is closed again even if the write of the field fails.
+            opened, it is closed again even if a write fails or its answer is lost.
         tries: number of writes before giving up. A refusal, a silence and another value read back all count, since
             a corrupted request can look like any of them.
         about: name of the servo in messages; `id 5` by default.
@@ -296,8 +296,8 @@ def verified_write(
     if lock is None or not field.eeprom:  # RAM, or an EEPROM without a lock (Dynamixel 2.0)
         yield from write(field, value)
         return
-    yield from write(lock, 0)
     try:
+        yield from write(lock, 0)
         yield from write(field, value)
     except BaseException:  # also if the caller closes this generator early
         link.write(servo_id, lock.address, lock.to_bytes(1))

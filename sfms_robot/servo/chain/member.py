@@ -209,9 +209,10 @@ class Member:
         self._trouble = NO_ANSWER
 
     def stopped(self) -> None:
-        """Note that no torque is wanted any more; `stop` switches it off."""
+        """Note that no torque is wanted any more; `stop` switches it off. `enable` then prepares the servo again."""
         self._drop_job()
         self.state = "off"
+        self.identified = False
 
     def released(self) -> None:
         """Request torque off until `enabled` or `called_back`; the poll writes it."""
@@ -403,10 +404,10 @@ class Member:
         return False
 
     def accepts(self, goal_ticks: int) -> bool:
-        """Return whether a goal continues from the position of this rejoining servo; if so, set it online."""
+        """Return whether a goal continues from the position of this rejoining servo; if so, it is driven again."""
         if abs(goal_ticks - self.stands_ticks) > NEAR * self.startup.table.ticks_per_revolution:
             return False
-        self.state = "online"
+        self.state = "reduced" if self._named and self.servo.safety.on_fault == "reduce" else "online"
         return True
 
     def _holds(self, ticks: int) -> None:
@@ -425,8 +426,8 @@ class Member:
         if policy == "hold":
             self.state = "faulty"
         elif policy == "reduce":
-            # A servo that holds got no goals: the next goal may be far from its position.
-            if self.state != "faulty":
+            # A servo that holds or rejoins got no goals: the next goal may be far from its position.
+            if self.state in _DRIVEN:
                 self.state = "reduced"
         elif policy == "reboot_and_ease_in" and self.startup.can_reboot:
             self._try_again(now_s, now_s, reboot=True)

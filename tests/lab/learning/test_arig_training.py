@@ -274,7 +274,6 @@ def test_what_is_wrong_in_a_training_file_is_said(raw, said):
         settings(**raw)
 
 
-# --- events -----------------------------------------------------------------------------------------------------
 def test_a_dyad_whose_events_nobody_knows_cannot_teach_a_listener_with_events(data):
     blank = replace(dyad("blank", "listening", 0), events=None)
     with pytest.raises(ConfigError, match="blank: expected events of its listener"):

@@ -95,7 +95,6 @@ def test_one_voice_has_the_phrases_of_all_and_the_look_of_the_one_who_speaks():
     assert several[:, at["several_speak"]].any() and not merged[:, at["several_speak"]].any()
 
 
-# --- what was done ----------------------------------------------------------------------------------------------
 KINDS = ("nod", "shake", "laugh", "smile", "mm_hm", "brow_raise", "blink", "tilt")
 
 

@@ -192,7 +192,6 @@ def test_scores_do_not_depend_on_size_or_offset_of_the_motion(scale: float, seed
     torch.testing.assert_close(plain, moved, rtol=1e-2, atol=1e-2)
 
 
-# --- As many as pay for themselves ---
 COST = st.floats(0.02, 20)
 
 

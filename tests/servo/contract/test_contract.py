@@ -375,7 +375,6 @@ def test_bytes_on_the_wire_are_those_that_are_counted(rig, request, count):
             assert spent(read) == framing.reads(count, where.size, way)
 
 
-# --- what servos have stored ------------------------------------------------------------------------------------
 REFUSED, WARNED, SET = "refused", "warned", "set"
 STORED = [  # family, register, value, what a start makes of it
     ("dynamixel2", "drive_mode", 1, REFUSED),
@@ -464,7 +463,6 @@ def test_a_servo_that_comes_back_with_less_protection_is_one_more_warning(name, 
     assert sum(f"comes back, and {register} is {value}" in each.getMessage() for each in caplog.records) == 1
 
 
-# --- torque that is not confirmed off ---------------------------------------------------------------------------
 def unconfirmed(rig):
     return rig.bus.statistics()["torque_unconfirmed"]
 
