@@ -125,6 +125,6 @@ def _mono(pcm: bytes, channels: int) -> bytes:
     if not isinstance(pcm, bytes | bytearray | memoryview):
         raise ConfigError(f"pcm: expected bytes, got {type(pcm).__name__}")
     if len(pcm) % (_PCM16.itemsize * channels):
-        raise ConfigError(f"pcm of {len(pcm)} bytes is not of 16-bit samples in {channels} channels")
+        raise ConfigError(f"pcm: expected 16-bit samples in {channels} channels, got {len(pcm)} bytes")
     mixed: bytes = np.frombuffer(pcm, _PCM16).reshape(-1, channels).mean(axis=1).astype(_PCM16).tobytes()
     return mixed

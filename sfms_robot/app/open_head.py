@@ -147,7 +147,9 @@ def open_head(options: HeadOptions) -> Iterator[OpenHead]:
         bus.connect()
         if weak := bus.statistics().get("stored_warnings"):
             log.warning(
-                "servos protect themselves otherwise than the head expects: %s; mend it: %s", "; ".join(weak), doctor
+                "protection stored in servos differs from the head's file: %s; to correct it: %s",
+                "; ".join(weak),
+                doctor,
             )
         yield OpenHead(options=options, config=head, motion=motion, bus=bus, clock=clock, opened=opened)
 

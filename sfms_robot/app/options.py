@@ -216,7 +216,7 @@ def begin_page(
             return None
         address = "auto"
     if options.fast:
-        raise ConfigError(f"--view {address}: a page shows what takes real time, --fast has none")
+        raise ConfigError(f"--view {address}: a page shows what takes real time, so --fast is not possible")
     if options.dry_run:
         raise ConfigError(f"--view {address}: nothing moves in a --dry-run")
     from sfms_robot.viewer.page_process import Address, PageProcess  # only for a run with a page

@@ -244,7 +244,7 @@ def _check(options: RunOptions) -> None:
         ("output", " ".join(options.outputs), bool(options.outputs), "what is shown elsewhere"),
     ):
         if options.fast and excluded:
-            raise ConfigError(f"--{flag} {value}: {why} takes real time, --fast has none")
+            raise ConfigError(f"--{flag} {value}: {why} takes real time, so --fast is not possible")
     if options.record is not None:
         check_folder(options.record, options.overwrite)
     elif options.record_format != "json":

@@ -329,7 +329,7 @@ def confirmation(yes: bool, ids: str = "") -> Callable[[str], bool]:
         if said:
             return said[0]
         if not sys.stdin.isatty():
-            raise ConfigError(f"{question}: no terminal to ask on, say --yes")
+            raise ConfigError(f"{question}: no terminal to ask on; confirm with --yes")
         answer = typer.confirm(f"{question}{alike}. Do it?", err=True)
         if alike:
             said.append(answer)

@@ -93,7 +93,7 @@ def register_problems(safety: Safety, table: FirmwareMap) -> Iterator[tuple[str,
         for name, value in given.items():
             register = table.registers.get(name)
             if register is None:
-                yield f"{key}.{name}", value, f"is no register of {table.model}", choices
+                yield f"{key}.{name}", value, f"is not a register of {table.model}", choices
             elif name not in choices:
                 yield f"{key}.{name}", value, _refusal(key, name, table), choices
             elif not register.low <= value <= register.high:
@@ -108,4 +108,4 @@ def _refusal(key: str, name: str, table: FirmwareMap) -> str:
             f"would be stored in {table.model} for good: set it once with `sfms-robot servo write`, "
             f"and let stored.{name} compare it; a run writes only"
         )
-    return f"of {table.model} is not the file's to set; it may set"
+    return f"of {table.model} must not be set by a head's file; it may set"

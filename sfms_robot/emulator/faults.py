@@ -102,7 +102,7 @@ def parse_fault(text: str, now_s: float = 0.0) -> Fault:
     if name == "voltage" and found["value"] is None:
         raise refuse("needs a value in volts, as in voltage=7.2")
     if found["value"] is not None and not kind.meaning:
-        raise refuse(f"takes no value: {name} is there or not")
+        raise refuse(f"has no value: {name} is there or not")
     try:
         start_s = now_s if found["start"] is None else float(found["start"])
         end_s = start_s + kind.lasts_s if found["end"] is None else float(found["end"])

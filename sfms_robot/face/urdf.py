@@ -264,7 +264,7 @@ class _UrdfReader:
             if name not in ordered:
                 raise self._wrong("joint", name, "does not hang on the robot's first link")
         if len(roots) != 1:
-            raise ConfigError(f"{self._file}: link {roots[1]!r} hangs on nothing; {roots[0]!r} is the robot's root")
+            raise ConfigError(f"{self._file}: link {roots[1]!r} has no parent joint; the root is {roots[0]!r}")
         return roots[0], ordered
 
     def _check_mimic(self, joint: JointElement, joints: Mapping[str, JointElement]) -> None:

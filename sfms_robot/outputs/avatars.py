@@ -56,7 +56,7 @@ class UdpOutput(Output):
         try:
             family, _, _, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
         except (OSError, UnicodeError) as error:
-            raise OutputError(f"no address of {host} is known: {getattr(error, 'strerror', None) or error}") from error
+            raise OutputError(f"no address found for {host}: {getattr(error, 'strerror', None) or error}") from error
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         self._socket.connect(where)

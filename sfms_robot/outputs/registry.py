@@ -74,7 +74,7 @@ def open_output(value: str, router: Router = LOCAL) -> Output:
     entry = output_kinds()[kind]
     output: Output = plug_in(entry, address, router) if kind == "ros2" else plug_in(entry, address)
     if not callable(getattr(output, "send", None)):
-        raise ConfigError(f"--output {kind}: {entry.value} gave a {type(output).__name__}, not an output")
+        raise ConfigError(f"--output {kind}: expected an output from {entry.value}, got a {type(output).__name__}")
     return output
 
 

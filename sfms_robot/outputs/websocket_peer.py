@@ -88,7 +88,7 @@ class WebSocketPeer:
         if not self._out:
             self._moved_s = now_s
         elif now_s - self._moved_s > SILENT_S:
-            raise OutputError(f"has taken no data for {SILENT_S:g} s")
+            raise OutputError(f"has accepted no data for {SILENT_S:g} s")
         if self._out and may_drop:
             self.dropped += 1
             return False

@@ -107,7 +107,7 @@ class HaltLatch:
         for name in active:
             self.close(name)
         if active:
-            raise HaltedError(f"still halted: {', '.join(active)}: still on; let go of it, then resume")
+            raise HaltedError(f"still halted: {', '.join(active)}: still on; release it, then resume")
         with self._changed:
             for cause, closing in before.items():
                 if door in ("device", cause[1]) and self._closed.get(cause) == closing:
@@ -219,7 +219,7 @@ def halt_switch(where: str, latch: HaltLatch) -> Iterator[None]:
         is_there = partial(_is_there, path)
         if is_there():
             raise ConfigError(
-                f"--halt-on {where}: is there already, or its folder cannot be read: the head would be halted"
+                f"--halt-on {where}: exists already, or its folder cannot be read, so the head would halt at once"
             )
         with _watching(where, latch, is_there, is_there):
             yield

@@ -178,7 +178,7 @@ class Recorder(Observer):
         self._thread.join()
         self._end()
         if self._trouble:
-            _log.warning("the recording is not whole: %s", self._trouble)
+            _log.warning("the recording is incomplete: %s", self._trouble)
         if self._dropped:
             _log.warning("the recording lacks %d values: the disk was too slow", self._dropped)
 

@@ -291,7 +291,7 @@ def board_of(bus: str, servos: Sequence[BusServo]) -> Table:
     table = servos[0].table
     others = sorted({servo.table.model for servo in servos} - {table.model})
     if others:
-        raise ConfigError(f"bus {bus!r}: one board is one model, the head says {table.model} and {', '.join(others)}")
+        raise ConfigError(f"bus {bus!r}: one board has one model, the head names {table.model} and {', '.join(others)}")
     if table.channels is None or table.pulse_us is None or table.tick_us is None:
         raise ConfigError(f"bus {bus!r}: expected a servo board, got {table.model}")
     for servo in servos:

@@ -248,7 +248,7 @@ class CompositeBus:
         if writer is None or writer.close(max(0.0, until_s - time.monotonic())):
             self._writers.pop(name, None)
             return True
-        log.warning("bus %r: hangs in the middle of a tick; its torque-off was sent, and is not confirmed", name)
+        log.warning("bus %r: does not finish its tick; torque off was sent but is not confirmed", name)
         return False
 
     def close(self) -> None:

@@ -90,9 +90,9 @@ class PulseBus(WireBus[RateLimitedPort]):
         self.model = table.model
         self._table, self._board = table, board_for(table, config.crc)
         if beyond := pulses_beyond(servos, conversion, table, table.pulse_us):
-            raise ConfigError(f"bus {name!r}: a {self.model} does not make the pulses of {beyond}")
+            raise ConfigError(f"bus {name!r}: a {self.model} cannot send the pulses of {beyond}")
         if wide := pulses_beyond(servos, conversion, table, self._board.factory_us):
-            log.warning("bus %r: set wider limits in the Maestro itself, over USB, for %s", name, wide)
+            log.warning("bus %r: widen the limits stored in the Maestro, over USB, for %s", name, wide)
         rest = np.zeros(len(servos)) if rest_rad is None else np.asarray(rest_rad, np.float64)
         self._ticks = conversion.to_ticks(self._goals.own.nearest(rest))  # last goals; before the first, the rest pose
         self._warned = False  # the warning that servos jump has been logged

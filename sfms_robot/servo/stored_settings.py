@@ -183,7 +183,7 @@ def _zero_and_direction(values: Values, table: Table, needs: JointNeeds) -> Iter
             yield Contradiction(name, values[name], 1, "one of its ticks is several", then="refused")
     for name, wanted in needs.stored.items():
         if name not in (*_OFFSETS, *_DIRECTION) and values.get(name, wanted) != wanted:
-            why = "the head's file reckons with it"
+            why = "the head's file was measured with it"
             yield Contradiction(name, values[name], wanted, why, then="refused", in_file=True)
 
 
@@ -226,9 +226,9 @@ def _shutdown(values: Values, table: Table, needs: JointNeeds) -> Iterator[Contr
     protecting = factory_bits(_PROTECTIONS)
     wanted = (now | protecting) & ~(factory_bits(needs.allowed_faults) & ~protecting)
     if missing := table.faults_in(wanted & ~now):
-        yield Contradiction(name, now, wanted, f"it goes on under {', '.join(missing)}", then="told")
+        yield Contradiction(name, now, wanted, f"it does not switch torque off on {', '.join(missing)}", then="told")
     elif extra := table.faults_in(now & ~wanted):
-        why = f"it gives way under {', '.join(extra)}, which the head's file says to live with"
+        why = f"it switches torque off on {', '.join(extra)}, which the head's file ignores"
         yield Contradiction(name, now, wanted, why, then="told")
 
 

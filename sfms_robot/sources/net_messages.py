@@ -113,7 +113,7 @@ def parse_message(data: bytes) -> Message:
     if version != VERSION:
         raise PacketError(f"a message of version {version}, not {VERSION}")
     if feed is None or zero:
-        raise PacketError(f"a message of kind {kind}, which a robot is not sent ({', '.join(FEEDS.values())})")
+        raise PacketError(f"a message of kind {kind}, which a program does not send ({', '.join(FEEDS.values())})")
     if not (math.isfinite(sent_s) and math.isfinite(at_s)):
         raise PacketError("a time that is not finite")
     if at_s and not sent_s:
@@ -134,7 +134,7 @@ def parse_message(data: bytes) -> Message:
 def _json(data: bytes) -> Hello | Hush:
     if found := _REALTIME.search(data[:LONGEST_JSON]):
         event = found[1].decode()
-        raise PacketError(f"{event!r} is an event of the OpenAI Realtime API, which is not spoken here: {_SOUND_IS}")
+        raise PacketError(f"{event!r} is an event of the OpenAI Realtime API, which is not supported: {_SOUND_IS}")
     if len(data) > LONGEST_JSON:
         raise PacketError(f"JSON of more than {LONGEST_JSON} bytes: {_SOUND_IS}")
     try:

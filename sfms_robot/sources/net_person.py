@@ -239,7 +239,7 @@ class NetPerson(NetServer):
     def _claim(self, connection: NetProgram, name: str) -> None:
         part = self._feeds.get(name)
         if part is None:
-            raise PacketError(f"this run takes no {name} from programs ({FLAGS[name]})")
+            raise PacketError(f"this run accepts no {name} from programs ({FLAGS[name]})")
         feeder = part.feeder
         if feeder is None:
             return
@@ -415,7 +415,7 @@ def open_browser_sight(argument: str, visitor: PageVisitor | None = None) -> Bro
 
 def _of_page(flag: str, argument: str, visitor: PageVisitor | None) -> PageVisitor:
     if argument:
-        raise ConfigError(f"{flag} browser:{argument}: takes nothing behind the colon ({flag} browser)")
+        raise ConfigError(f"{flag} browser:{argument}: expected nothing after the colon ({flag} browser)")
     if visitor is None:
         raise ConfigError(f"{flag} browser: there is no page (sfms-robot run --view serves one)")
     return visitor

@@ -307,7 +307,7 @@ def as_floats(pcm: Pcm) -> Floats:
     """
     if isinstance(pcm, bytes | bytearray | memoryview):
         if len(pcm) % 2:
-            raise ConfigError(f"pcm of {len(pcm)} bytes is not of 16-bit samples")
+            raise ConfigError(f"pcm: expected 16-bit samples, got {len(pcm)} bytes")
         pcm = np.frombuffer(pcm, dtype="<i2")
     samples = np.asarray(pcm)
     if samples.ndim not in (1, 2) or (samples.dtype != np.int16 and samples.dtype.kind != "f"):

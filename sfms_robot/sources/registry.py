@@ -107,7 +107,7 @@ def check_source(
             raise ConfigError(f"{flag} {value}: {problem} ({', '.join([*kinds, *files])})")
     if play is not None and (agent_audio == "none" or split_kind(agent_audio)[0] == "device"):
         choices = ", ".join(["FILE.wav", "tcp", *speakers])
-        raise ConfigError(f"--play {play}: nothing is played of --agent-audio {agent_audio} ({choices})")
+        raise ConfigError(f"--play {play}: nothing to play of --agent-audio {agent_audio} ({choices})")
 
 
 def open_source(
@@ -180,7 +180,7 @@ def _opened(failed: ExitStack, flag: str, value: str, **more: Any) -> Any:
     part = plug_in(kind, argument, more[name]) if name in more else plug_in(kind, argument)
     if not any(hasattr(part, method) for method in _PARTS[flag]):
         wanted = " or ".join(_PARTS[flag].values())
-        raise ConfigError(f"{flag} {name}: {kind.value} gave a {type(part).__name__}, no {wanted}")
+        raise ConfigError(f"{flag} {name}: expected a {wanted} from {kind.value}, got a {type(part).__name__}")
     failed.callback(part.close)
     return part
 

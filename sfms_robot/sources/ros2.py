@@ -97,7 +97,7 @@ class Ros2Voice(_Subscriber, PushedVoice):
         sound = message["audio"]["data"].tobytes()
         if len(sound) % (2 * self._channels) or sound.startswith(_FILES):
             what = "a sound file" if sound.startswith(_FILES) else f"{len(sound)} bytes"
-            raise PacketError(f"data: expected 16-bit samples, {self._channels} in a row (format wave), got {what}")
+            raise PacketError(f"data: expected 16-bit samples of {self._channels} channels (format wave), got {what}")
         samples = np.frombuffer(sound, "<i2").reshape(-1, self._channels)
         self.hear(samples if self._channels > 1 else samples[:, 0], self._sent_hz)
 

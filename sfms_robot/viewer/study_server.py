@@ -58,7 +58,7 @@ def study_app(study: Comparison, token: str | None = None) -> ASGIApp:
             return JSONResponse({"participant": study.begin(), "questions": dict(study.questions)})
         participant = given.get("participant")
         if not isinstance(participant, str) or not participant.isalnum() or len(participant) > MOST_NAME:
-            raise ConfigError("participant is what /begin gave")
+            raise ConfigError("participant: expected the name that /begin returned")
         if path == "/answer":
             number, chosen = given.get("trial"), given.get("answers")
             if not isinstance(number, int) or not isinstance(chosen, dict):

@@ -96,9 +96,9 @@ def test_sound_that_cannot_be_used_is_named_and_the_pipeline_continues(caplog):
     assert robot.heard == [(b"\2\0" * 99, 16000)] and head.robot_link.refused == {"voice": 4}
     lines = [record.message for record in caplog.records if record.name == "sfms_robot.agents"]
     assert lines == [
-        "pipecat: voice: pcm of 3 bytes is not of 16-bit samples (said once)",
+        "pipecat: voice: pcm: expected 16-bit samples, got 3 bytes (said once)",
         "pipecat: voice: rate_hz = '16000': expected a rate of speech (4000 to 384000) (said once)",
-        "pipecat: voice: pcm of 6 bytes is not of 16-bit samples in 2 channels (said once)",
+        "pipecat: voice: pcm: expected 16-bit samples in 2 channels, got 6 bytes (said once)",
     ]
 
 

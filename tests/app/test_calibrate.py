@@ -356,7 +356,7 @@ def test_run_and_doctor_say_alike_that_servos_give_way_under_a_fault_that_the_he
     ended = command_line("run", "--head", folder, "--duration", 0.2, "--fast", "--json")
     (line,) = ended.told["bus"]["stored_warnings"]
     names, _, said = line.partition(": ")
-    assert ended.code == 0 and names.startswith("stewart_1, ") and "it gives way under input voltage" in said
+    assert ended.code == 0 and names.startswith("stewart_1, ") and "it switches torque off on input voltage" in said
     findings = command_line("doctor", "--head", folder, "--port", "sim", "--json").told["findings"]
     assert [each["severity"] for each in findings if said in each["problem"]] == ["warning"]
 
@@ -365,7 +365,7 @@ def test_less_protection_is_one_warning_and_a_line_in_the_report(turret, command
     (turret / "emulate.yaml").write_text("joints: {tilt: {shutdown: 0}, pan: {shutdown: 0}}\n")
     ended = command_line("run", "--head", turret, "--duration", 0.2, "--fast", "--json")
     (line,) = ended.told["bus"]["stored_warnings"]
-    assert ended.code == 0 and line.startswith("pan, tilt: shutdown is 0, wanted 52: it goes on under")
+    assert ended.code == 0 and line.startswith("pan, tilt: shutdown is 0, wanted 52: it does not switch torque off on")
     assert [record for record in caplog.records if "shutdown" in record.getMessage()] == [
         record for record in caplog.records if f"doctor --port sim --head '{turret}' --fix" in record.getMessage()
     ]

@@ -37,8 +37,8 @@ def test_joint_says_what_is_different_from_its_head():
 @pytest.mark.parametrize(
     ("safety", "message"),
     [
-        ({"registers": {"position_q_gain": 1}}, r"position_q_gain = 1 is no register of xl330-m288 \(.*pos"),
-        ({"registers": {"present_position": 1}}, "present_position = 1 of xl330-m288 is not the file's to set"),
+        ({"registers": {"position_q_gain": 1}}, r"position_q_gain = 1 is not a register of xl330-m288 \(.*pos"),
+        ({"registers": {"present_position": 1}}, "present_position = 1 of xl330-m288 must not be set by a head's file"),
         ({"registers": {"position_p_gain": 99999}}, r"position_p_gain = 99999 does not fit xl330-m288 \(0..16383\)"),
     ],
 )

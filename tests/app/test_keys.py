@@ -117,7 +117,7 @@ def test_a_resume_that_is_refused_is_answered_on_the_terminal():
         shown.press(b" ")
         shown.until(" halted ")
         shown.press(b"r")
-        shown.until("still halted: button: still on; let go of it")
+        shown.until("still halted: button: still on; release it")
         shown.press(b"q")
         assert " listening " not in shown.until(SHOW)
 

@@ -64,8 +64,8 @@ def test_degrees_are_those_of_the_shaft_and_a_servo_that_held_goes_on_holding():
     [
         ("9999", None, {}, "outside its limits"),
         ("2200", None, {"min_position_limit": 2000, "max_position_limit": 2100}, "2000..2100"),
-        (None, None, {}, "one of them"),
-        ("5", "5", {}, "one of them"),
+        (None, None, {}, "expected either --to or --by"),
+        ("5", "5", {}, "expected either --to or --by"),
         ("x", None, {}, "not a place"),
         ("2050", None, {"operating_mode": 1}, "sfms-robot servo write 1 operating_mode 3 --port /"),
     ],

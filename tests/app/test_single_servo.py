@@ -305,7 +305,7 @@ def test_a_new_servo_becomes_the_old_one_and_keeps_its_own_id(model, tmp_path):
     family, registers = SET[model]
     with wire_on(new(1, model, **registers), new(2, model), family=family) as (wire, _):
         single.save_dump(single.dump([wire.find(1)]), tmp_path / "servos.yaml")
-        with pytest.raises(ConfigError, match="is there already"):  # it may be the only copy
+        with pytest.raises(ConfigError, match="exists already"):  # it may be the only copy
             single.save_dump(single.dump([wire.find(2)]), tmp_path / "servos.yaml")
         (was,) = load(single.Dump, tmp_path / "servos.yaml").servos
         assert (was.id, was.model) == (1, model)

@@ -40,7 +40,7 @@ def test_spec_is_read(text, kind, ids, start_s, end_s, value):
         ("drop:1-999", "holds a bad number"),
         ("drop@4-2", "ends at 2 s, before it starts"),
         ("drop@1.2.3", "holds a bad number"),
-        ("stuck:1=4", "takes no value"),
+        ("stuck:1=4", "has no value"),
         ("noise:3", "cannot name ids"),
         ("request-drop:3", "cannot name ids: request-drop concerns the whole wire"),
         ("request-drop=2", "is out of range: fraction of requests of request-drop (0..1)"),

@@ -82,7 +82,7 @@ def test_a_receiver_that_is_away_is_reported_on_this_machine(kind):
 
 
 def test_a_name_without_an_address_is_reported():
-    with pytest.raises(OutputError, match=r"no address of no\.such\.machine\.invalid is known"):
+    with pytest.raises(OutputError, match=r"no address found for no\.such\.machine\.invalid"):
         VmcOutput("no.such.machine.invalid").open()
 
 

@@ -192,5 +192,5 @@ def test_a_kind_that_gives_no_output_is_refused(tmp_path, monkeypatch):
     (tmp_path / "odd-1.0.dist-info").mkdir()
     (tmp_path / "odd-1.0.dist-info" / "entry_points.txt").write_text("[sfms_robot.outputs]\nodd = builtins:list\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(ConfigError, match="gave a list, not an output"):
+    with pytest.raises(ConfigError, match="expected an output from .*, got a list"):
         open_output("odd")

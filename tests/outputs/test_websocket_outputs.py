@@ -422,7 +422,7 @@ def test_a_peer_that_takes_nothing_costs_frames_and_then_the_connection(caplog):
                 break
         assert output.statistics()["dropped"] == 300
         assert "is slower than 50 frames a second" in caplog.text
-        assert answered(output, frame, now_s, step_s=0.02) == "has taken no data for 2 s"
+        assert answered(output, frame, now_s, step_s=0.02) == "has accepted no data for 2 s"
         output.close()
 
 

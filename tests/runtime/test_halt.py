@@ -282,8 +282,8 @@ def test_a_handler_does_not_wait_for_the_latch_that_it_interrupts() -> None:
     ("where", "says"),
     [
         ("{tmp}/no/stop", "no such folder"),
-        ("{tmp}", "is there already"),
-        ("{tmp}/a/b", "is there already, or its folder cannot be read"),
+        ("{tmp}", "exists already"),
+        ("{tmp}/a/b", "exists already, or its folder cannot be read"),
         ("/dev/gpiochip97:4", "No such file"),
     ],
 )

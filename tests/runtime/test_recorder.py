@@ -127,7 +127,7 @@ def test_a_value_that_cannot_be_written_is_trouble_told_once_and_not_a_crash(tmp
     recorder.tick(tick(0.0))
     recorder.tick(tick(0.1))
     recorder.close()
-    assert "zip()" in recorder.statistics()["trouble"] and "the recording is not whole" in caplog.text
+    assert "zip()" in recorder.statistics()["trouble"] and "the recording is incomplete" in caplog.text
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="no /dev/full")

@@ -194,7 +194,7 @@ def test_torque_off_from_outside_ends_enable_with_torque_off():
             rig.bus.torque_off("release")
 
     rig.clock.wait_until = wait_until
-    with pytest.raises(BusError, match="torque off was asked for while joint2 was being enabled"):
+    with pytest.raises(BusError, match="torque off was requested while joint2 was being enabled"):
         rig.bus.enable(rig.bus.joints)
     rig.bus.stop("release")
     assert not any(rig.state(i)["torque"] for i in (1, 2))

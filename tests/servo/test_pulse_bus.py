@@ -185,7 +185,7 @@ def test_asking_the_board_blocks_nobody(bench):
     ("model", "channel", "limit_rad", "problem"),
     [
         ("maestro-6", 9, LIMIT_RAD, r"joints.joint9.id: expected a channel of a maestro-6 \(0..5\), got 9"),
-        ("ssc-32", 0, 1.6, r"a ssc-32 does not make the pulses of joint0 \(\d+..\d+ us"),
+        ("ssc-32", 0, 1.6, r"a ssc-32 cannot send the pulses of joint0 \(\d+..\d+ us"),
     ],
 )
 def test_what_the_board_does_not_have_is_refused(model, channel, limit_rad, problem):
@@ -196,13 +196,13 @@ def test_what_the_board_does_not_have_is_refused(model, channel, limit_rad, prob
 def test_range_beyond_the_factory_limits_of_a_maestro_is_said(caplog):
     with caplog.at_level(logging.WARNING):
         Bench("maestro-24", channels=[0], limit_rad=1.2)
-    assert "set wider limits in the Maestro itself" in caplog.text
+    assert "widen the limits stored in the Maestro" in caplog.text
 
 
 def test_two_boards_on_one_bus_are_refused():
     six, all_ = load_firmware_map("maestro-6"), load_firmware_map("maestro-24")
     servos = [bus_servo("a", 0, six, 0.1), bus_servo("b", 1, all_, 0.1)]
-    with pytest.raises(ConfigError, match="one board is one model, the head says maestro-6 and maestro-24"):
+    with pytest.raises(ConfigError, match="one board has one model, the head names maestro-6 and maestro-24"):
         config = BusConfig(family="maestro", baud=115200)
         PulseBus("face", servos, Straight(six), lambda: EmulatedPort(None), 115200, 0.0, config)
 

@@ -67,7 +67,7 @@ def test_a_hello_says_what_it_feeds_and_wants():
         (b'{"type": "session.update", "session": {}}', "'session.update' is an event of the OpenAI Realtime API"),
         (b'{"type": "input_audio_buffer.append", "audio": "' + b"A" * 9000 + b'"}', "Realtime API, .*: sound comes in"),
         (HEADER.pack(VOICE, 2, 0, 16000, 0, 0), "version 2, not 1"),
-        (HEADER.pack(9, 1, 0, 16000, 0, 0), r"kind 9, which a robot is not sent \(voice, face, speech\)"),
+        (HEADER.pack(9, 1, 0, 16000, 0, 0), r"kind 9, which a program does not send \(voice, face, speech\)"),
         (HEADER.pack(VOICE, 1, 7, 16000, 0, 0), "kind 1"),
         (HEADER.pack(VOICE, 1, 0, 100, 0, 0), r"sound of 100 samples a second \(4000 to 384000\)"),
         (HEADER.pack(VOICE, 1, 0, 16000, 0, 0) + b"abc", "not of 16-bit samples"),

@@ -329,7 +329,7 @@ def test_a_run_that_takes_only_speech_says_so():
         speech.start(0.0)
         (person,) = speech.outlets
         program = Tcp(type("Only", (), {"person": person}), feeds=["voice"])
-        assert last_words(program) == "this run takes no voice from programs (--audio push)"
+        assert last_words(program) == "this run accepts no voice from programs (--audio push)"
 
 
 @pytest.mark.parametrize("sent", [b"", b"GE", b"GET / HTTP/1.1\r\nHost: x\r\n"])

@@ -88,7 +88,7 @@ def test_bytes_integers_floats_and_channels_mean_the_same():
     [
         (np.zeros(9), 1, "rate_hz = 1: expected a rate"),
         (np.zeros(9), float("nan"), "rate_hz = nan"),
-        (b"abc", 16000, "3 bytes is not of 16-bit"),
+        (b"abc", 16000, "expected 16-bit samples, got 3 bytes"),
         (np.zeros(9, dtype=np.int64), 16000, "pcm is int64"),
         (np.zeros((2, 2, 2)), 16000, r"shape \(2, 2, 2\)"),
         (np.zeros((9, 9)), 16000, r"shape \(9, 9\): expected \(n, channels\) or \(channels, n\)"),

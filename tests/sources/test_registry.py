@@ -82,9 +82,9 @@ def test_what_is_no_voice_or_no_face_or_brings_its_own_is_refused(install):
     with pytest.raises(ConfigError, match="--face push: --audio person brings its own"):
         open_source("person", "push")
     assert inner.closed
-    with pytest.raises(ConfigError, match="--audio eye: theirs:eye gave a PushedSight, no voice or source"):
+    with pytest.raises(ConfigError, match="--audio eye: expected a voice or source from theirs:eye, got a PushedSight"):
         open_source("eye")
-    with pytest.raises(ConfigError, match="--face ear: theirs:ear gave a PushedVoice, no face"):
+    with pytest.raises(ConfigError, match="--face ear: expected a face from theirs:ear, got a PushedVoice"):
         open_source("none", "ear")
 
 

@@ -91,7 +91,7 @@ def test_sound_that_is_not_samples_is_refused_by_what_it_is(router, caplog, data
     with closing(Ros2Voice("mic", router)) as voice:
         send(voice, router, "/mic", wire_name(AUDIO), to_cdr(AUDIO, {"audio": {"data": data}}), "refused")
     (line,) = [line for line in caplog.messages if "left out" in line]
-    assert "data: expected 16-bit samples, 1 in a row (format wave), got" in line
+    assert "data: expected 16-bit samples of 1 channels (format wave), got" in line
 
 
 def test_where_nothing_comes_one_line_says_why(router, tmp_path, caplog):

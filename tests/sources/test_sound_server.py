@@ -252,7 +252,7 @@ def test_a_loudspeaker_that_is_not_there_is_one_line_with_the_choices(sound_serv
 
 @pytest.mark.parametrize("agent_audio", ["none", "device:robot.monitor"])
 def test_what_is_not_said_here_is_not_played(agent_audio):
-    with pytest.raises(ConfigError, match=f"^--play default: nothing is played of --agent-audio {agent_audio} .*tcp"):
+    with pytest.raises(ConfigError, match=f"^--play default: nothing to play of --agent-audio {agent_audio} .*tcp"):
         open_source("none", "none", agent_audio=agent_audio, play="default")
 
 

@@ -79,8 +79,8 @@ def test_a_person_answers_all(study):
     [
         ("next", b"{", b"a message is one JSON object"),
         ("next", b"[]", b"a message is one JSON object"),
-        ("next", b"{}", b"participant is what /begin gave"),
-        ("next", {"participant": "../../etc"}, b"participant is what /begin gave"),
+        ("next", b"{}", b"participant: expected the name that /begin returned"),
+        ("next", {"participant": "../../etc"}, b"participant: expected the name that /begin returned"),
         ("answer", {"participant": "me"}, b"an answer needs a number `trial` and a table `answers`"),
         ("answer", {"participant": "me", "trial": 9, "answers": {}}, b"trial = 9 is not one of this study"),
         ("next", b" " * 5000, b"a message of more than 4096 bytes"),

@@ -207,7 +207,7 @@ class Guide:
         self.say(f"  {low}..{rest}..{high} ticks, {travel_deg:.1f} deg (its file: {joint.max_deg - joint.min_deg:.1f})")
         if sign != joint.sign:
             turns = "fall" if sign < 0 else "rise"
-            said = f"  Ticks {turns} towards the upper end, other than its file says. Is that so? Enter: yes, n: no > "
+            said = f"  Ticks {turns} towards the upper end, its file has the other sign. Right? Enter: yes, n: no > "
             if self._ask(said) == "n":
                 raise AgainError("its ends were mixed up")
         self._check_ends(low, high, rest, at)

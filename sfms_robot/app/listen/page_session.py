@@ -203,7 +203,7 @@ class PageSession:
             self._want({"audio": BROWSER, "face": BROWSER, "duration_s": None})
         elif missing := [feed for feed in feeds if feed not in taken]:
             flags = {"voice": "--audio", "face": "--face"}
-            raise InputError(f"source: this run takes no {missing[0]} from a visitor ({flags[missing[0]]} {BROWSER})")
+            raise InputError(f"source: this run accepts no {missing[0]} from a visitor ({flags[missing[0]]} {BROWSER})")
         self._visitor.came(visitor, feeds)
 
     def _want(self, changes: Facts) -> None:

@@ -57,7 +57,7 @@ def play_back(
     recording = read_recording(folder)
     head = head or recording.about.get("head")
     if head is None:
-        raise ConfigError(f"{folder}: does not say which head it is of: --head NAME or DIR")
+        raise ConfigError(f"{folder}: the recording names no head: give it with --head NAME or DIR")
     options = HeadOptions(head=head, port=port, fast=fast, yes=yes)
     report = recorded_face(recording).play(options, panel, listener="recorded")
     return {

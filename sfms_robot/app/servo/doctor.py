@@ -84,7 +84,7 @@ def examine(
         head = DEFAULT_HEAD
     for key, value in (("--family", family), ("--baud", baud)):
         if head is not None and value is not None:
-            raise ConfigError(f"{key} {value}: head {head!r} says that of each of its buses; leave out one of the two")
+            raise ConfigError(f"{key} {value}: head {head!r} sets this for each of its buses; leave out one of the two")
     family = family or DEFAULT_FAMILY
     check_baud(family, baud)
     with ExitStack() as stack:

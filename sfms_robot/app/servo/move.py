@@ -94,7 +94,7 @@ def _startup(seen: FoundServo) -> Startup:
 
 def _target(seen: FoundServo, limits: tuple[int, int], start: int, to: str | None, by: str | None) -> int:
     if (to is None) == (by is None):
-        raise ConfigError("servo move: say --to TICKS or --by TICKS, one of them (or degrees: --by -5deg)")
+        raise ConfigError("servo move: expected either --to or --by, in ticks or degrees (--by -5deg)")
     text = to if to is not None else by or ""
     number, unit = parse_number(text)
     if not number or unit not in ("", "deg"):

@@ -282,7 +282,7 @@ def only_port() -> str:
     names = [each.by_id or each.path for each in list_ports()]
     if len(names) == 1:
         return names[0]
-    there = "several serial ports" if names else "no serial port here"
+    there = "several serial ports" if names else "no serial port found"
     raise ConfigError(f"--port: {there}, say which ({', '.join([*names, SIM])})")
 
 

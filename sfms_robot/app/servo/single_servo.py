@@ -288,7 +288,9 @@ def set_id(seen: FoundServo, new: int, confirm: Confirm, in_chain: bool = False)
     _move_to(seen, "id", new, new_id=new)
     changed = wire.ping(new)
     if changed is None:
-        raise ServoError(f"id {seen.id} was set to {new}, and no servo answers as {new}")
+        raise ServoError(
+            f"servo {seen.id}: wrote id {new}, but no servo answers at id {new} (it may need a power cycle)"
+        )
     if wire.ping(seen.id) is not None:
         raise ServoError(f"id {new} answers, and so does {seen.id}: two servos had one id, unplug one and look again")
     return changed
@@ -421,7 +423,7 @@ def dump(servos: Sequence[FoundServo]) -> Dump:
 def check_new(file: Path) -> None:
     """Raise ConfigError if a dump cannot be written or the file exists, which may be the only copy of settings."""
     if file.exists():
-        raise ConfigError(f"{file}: is there already, name another file")
+        raise ConfigError(f"{file}: exists already, name another file")
     checked_file(file, "servo dump")
 
 

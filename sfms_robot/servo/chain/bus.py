@@ -179,7 +179,7 @@ class ChainBus(WireBus[RegisterLink]):
             if not member.listed:
                 member.awaited()
                 held.append(member.servo.nearest_to_zero_rad)
-                self._notices.add(member.servo, "does not answer; it comes in when it does")
+                self._notices.add(member.servo, "does not answer; it is started when it answers")
                 continue
             self._forget(member)
             self._powered |= {member.id}
@@ -204,7 +204,7 @@ class ChainBus(WireBus[RegisterLink]):
         link.wait(duration_s)
         if self._released:
             self.torque_off("release")
-            raise BusError(f"bus {self.name!r}: torque off was asked for while {joint} was being enabled")
+            raise BusError(f"bus {self.name!r}: torque off was requested while {joint} was being enabled")
 
     def _hold(self, index: int) -> float:
         """Extend the range of a servo to the position that it holds; return its angle."""

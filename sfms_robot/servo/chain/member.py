@@ -447,7 +447,7 @@ class Member:
             recent.append(now_s)
             self._return(due_s, reboot)
             return
-        self._notices.add(self.servo, f"came back {len(recent)} times in {FORGET_S:g} s, and is left alone")
+        self._notices.add(self.servo, f"came back {len(recent)} times in {FORGET_S:g} s, and is given up")
         self._release(math.inf)
         self.state = "given up"
         self._trouble = GIVEN_UP

@@ -149,7 +149,7 @@ class StatusPoll:
             with self.link.patient(_GROUP_TRIAL_S):
                 group = len(self.link.read_many(*self._telemetry.block, present)) == len(present)
             if not group:
-                log.info("bus %r: not every servo answers a request for several: they are read one by one", self._bus)
+                log.info("bus %r: not every servo answers group requests: they are read one by one", self._bus)
         self.restart(group)
 
     def _plan(self) -> None:
