@@ -94,14 +94,13 @@ class Tracks:
 def tracks(motion: Tensor, member: Tensor, most: int) -> Tracks:
     """Return the tracks of motion (B, T, C) with groups `member` (G, C) and `most` principal curves each."""
     centred = motion - motion.mean(1, keepdim=True)
-    curves, costs = [], []
+    found, widest = [], int(member.sum(1).max())
     for row in member:
         own = centred[..., row > 0.5]  # (B, T, c)
         own = own / own.square().sum(-1).mean(1).sqrt().clamp(min=STILL)[:, None, None]
-        curves.append(_principal(own, most))
-        costs.append([part.float() for part in segments(own)])
-    parts = [torch.stack(part, 1).flatten(0, 1) for part in zip(*costs, strict=True)]
-    return Tracks(torch.stack(curves, 1).flatten(0, 1), Segments(*parts))
+        found.append((_principal(own, most), F.pad(own, (0, widest - own.shape[-1]))))  # zeros add no error
+    curves, padded = (torch.stack(part, 1).flatten(0, 1) for part in zip(*found, strict=True))
+    return Tracks(curves, Segments(*(part.float() for part in segments(padded))))
 
 
 def _principal(own: Tensor, most: int) -> Tensor:
@@ -270,11 +269,11 @@ def place_learned(
     Categorical(exp(s / temperature)), as in equation (6), so the noise grows with the temperature.
     """
     if temperature == 0.0:
-        hard = torch.cat([_top_k(scores[..., g], c)[..., None] for g, c in enumerate(k)], dim=-1)
+        hard = torch.stack([_top_k(scores[..., g], c) for g, c in enumerate(k)], dim=-1)
         return hard, hard
     gumbel = -torch.log(-torch.log(_uniform_like(scores, generator)))
     noisy = scores + gumbel * (temperature if tempered else 1.0)  # lines 3 to 6: s_i + g_i
-    relaxed = torch.stack([_relaxed_k_hot(noisy[..., g], c, temperature) for g, c in enumerate(k)], dim=-1)
+    relaxed = _relaxed_k_hot(noisy, k, temperature)
     hard = torch.stack([_top_k(relaxed[..., g], c) for g, c in enumerate(k)], dim=-1)  # lines 14 to 16
     return hard - relaxed.detach() + relaxed, relaxed  # line 18
 
@@ -300,13 +299,14 @@ def _uniform_like(scores: Tensor, generator: torch.Generator | None) -> Tensor:
     return torch.rand(scores.shape, generator=generator, device=source).to(scores.device).clamp(1e-7, 1 - 1e-7)
 
 
-def _relaxed_k_hot(noisy: Tensor, count: int, temperature: float) -> Tensor:
-    """Return the sum of k softmaxes, each without the frames that the earlier ones have chosen (lines 7 to 13)."""
-    k_hot, one_hot = torch.zeros_like(noisy), torch.zeros_like(noisy)
-    for _ in range(count):
+def _relaxed_k_hot(noisy: Tensor, k: Sequence[int], temperature: float) -> Tensor:
+    """Return the sums (B, T, G) of k softmaxes, each without the frames that the earlier ones chose (lines 7 to 13)."""
+    k_hot = one_hot = torch.zeros_like(noisy)
+    counts = noisy.new_tensor(k)
+    for step in range(max(k)):
         noisy = noisy + torch.log(torch.clamp(1.0 - one_hot, min=EPSILON))  # lines 9, 10
-        one_hot = torch.softmax(noisy / temperature, dim=-1)  # line 11
-        k_hot = k_hot + one_hot  # line 12
+        one_hot = torch.softmax(noisy / temperature, dim=1)  # line 11
+        k_hot = k_hot + one_hot * (step < counts)  # line 12
     return k_hot
 
 
