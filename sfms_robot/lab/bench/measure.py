@@ -34,7 +34,7 @@ MAIN: Final = ("-P", "-c", "from sfms_robot.cli.main import main; main()")
 _PAGE: Final = """# Measured by `sfms-robot bench`
 
 Written by `make bench`, {when}, on {machine}, in {minutes:.1f} minutes.
-Speeds are of that machine; what travels is the ratio: each figure beside its peer, both measured in the same run.
+Speeds hold for that machine. The ratio to a peer, measured in the same run, carries over to other machines.
 
 | measured | median | p99 | ratio | to | repeats |
 |---|---|---|---|---|---|
