@@ -18,21 +18,23 @@ EPILOG = "\n\n".join(
 
 
 def bench(
-    name: str = Argument(ALL, autocompletion=lambda: [ALL, *BENCHES], help="The bench; all: see below."),
-    head: str | None = Option(None, help="For 'lead' and 'memory': this head."),
-    minutes: float | None = Option(None, min=0.0, help="For 'live': so long; else 10 min, 30 with --torture."),
+    name: str = Argument(
+        ALL, autocompletion=lambda: [ALL, *BENCHES], help="Name of the bench; all runs every one (listed below)."
+    ),
+    head: str | None = Option(None, help="Head, for 'lead' and 'memory'."),
+    minutes: float | None = Option(None, min=0.0, help="Duration of 'live'. Default: 10 min, 30 with --torture."),
     audio: Literal["mic", "push"] | None = Option(
-        None, help="For 'live': an emulated microphone (the default), or calls."
+        None, help="Input of 'live': an emulated microphone (the default), or calls."
     ),
-    torture: bool = Option(False, "--torture", help="For 'live': kill, stop, cut and unplug at random meanwhile."),
-    against: Path | None = Option(
-        None, help="A folder with another installation: it becomes the peer, and the two run in turn."
+    torture: bool = Option(False, "--torture", help="For 'live': kill, stop, cut and unplug parts at random."),
+    against: Path | None = Option(None, help="Folder with another installation to compare with; the two run in turn."),
+    hours: float | None = Option(None, min=0.1, help="Virtual hours, for 'memory'. Default: 4."),
+    data: Path | None = Option(None, help="Folder of calls for 'own-voice': NAME_caller and NAME_agent."),
+    device: Literal["cpu", "cuda"] | None = Option(
+        None, help="Device of 'serve'; cuda: 64, 256 and 1,024 heads on a GPU."
     ),
-    hours: float | None = Option(None, min=0.1, help="For 'memory': virtual hours (4)."),
-    data: Path | None = Option(None, help="For 'own-voice': a folder of calls, NAME_caller and NAME_agent each."),
-    device: Literal["cpu", "cuda"] | None = Option(None, help="For 'serve': cuda: 64, 256, 1,024 heads on a GPU."),
     write: Path | None = Option(
-        None, metavar="FILE", help="Write the rows as a page too (docs/science/performance.md)."
+        None, metavar="FILE", help="Also write the rows as a page (docs/science/performance.md)."
     ),
     json: bool = JSON,
 ) -> None:

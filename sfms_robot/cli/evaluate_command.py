@@ -18,8 +18,8 @@ Part = Literal["train", "validation", "test"]  # parts of meetings and voices (`
 Unseen = Literal["validation", "test"]
 LISTENER = Option("sfms-small", help="Shipped listener, or a folder with config.yaml and weights.")
 SPLIT = Option("test", help="Dyads: test to report, validation to choose.")
-JOBS = Option(None, min=1, help="Processes; as many as there are cores.")
-SEED = Option(1, min=0, max=MAX_SEED, help="Seed of everything that is random.")
+JOBS = Option(None, min=1, help="Processes. Default: one for each core.")
+SEED = Option(1, min=0, max=MAX_SEED, help="Seed of all random numbers.")
 ENGINE_HELP = "Engine of the listener; its precision is that of its config.yaml."
 _INTERVALS = "in brackets: 95 % intervals over people. Rows of the paper are from other data: compare ratios."
 _ANSWERS = "{participants} people, {answers} answers"
@@ -29,23 +29,25 @@ _TABLES = {  # tables of the SFMS paper, and the tables that their figures come 
     "3-placements": "Every placement with both inpainters",
     "4-codes": "Kinds of codes, alike",
 }
-HOP = Option(None, min=1, help="Frames between plans, as a run chooses them; default: that of its config.yaml.")
+HOP = Option(None, min=1, help="Frames between plans. Default: those of its config.yaml.")
 
 
 @app.command()
 def tokenizer(
     listener: str = LISTENER,
     table: str | None = Option(
-        None, metavar="3|4|all|3-placements|4-codes", help="A table of the SFMS paper, or both, or what is behind one."
+        None, metavar="3|4|all|3-placements|4-codes", help="Table of the SFMS paper, both, or details of one of them."
     ),
     data: Path | None = Option(
         None, help="Composed dyads; with --table any folder of face tracks (CSV), or the held-out recordings."
     ),
-    models: Path | None = Option(None, help="Folder of the table's tokenizers, trained if missing; the shipped."),
+    models: Path | None = Option(
+        None, help="Folder of the table's tokenizers, trained if missing. Default: the shipped ones."
+    ),
     train: bool = Option(False, "--train", help="Train the table's tokenizers again, into --models."),
-    size: Literal["small", "paper"] = Option("small", help="Of what is trained; paper: for a GPU."),
-    steps: int | None = Option(None, min=1, help="Another number of training steps than the size's."),
-    seeds: int = Option(1, min=1, help="Trainings of each tokenizer of the table, into --models."),
+    size: Literal["small", "paper"] = Option("small", help="Size of trained tokenizers; paper: for a GPU."),
+    steps: int | None = Option(None, min=1, help="Training steps. Default: those of the size."),
+    seeds: int = Option(1, min=1, help="Trainings of each tokenizer, kept in --models."),
     only: str = Option("*", metavar="PATTERN", help="Tokenizers of the table, as in 'sparse-all-k7,*-static'."),
     jobs: int = Option(1, min=1, help="Tokenizers trained at once."),
     plots: Path | None = Option(None, metavar="DIR", help="Draw the pictures of --table as PNG files."),
@@ -53,7 +55,7 @@ def tokenizer(
     split: Unseen = SPLIT,
     json: bool = JSON,
 ) -> None:
-    """Reconstruction error: a listener's by keyframe placement, or a table of the SFMS paper."""
+    """Evaluate reconstruction: of a listener by keyframe placement, or a table of the SFMS paper."""
     if table is None:
         from sfms_robot.lab.evaluation.listener_tables import evaluate_tokenizer
 
@@ -85,19 +87,21 @@ def tokenizer(
 @app.command("listener")
 def listener_(
     listener: list[str] = Option(
-        [], metavar="NAME|DIR", help="May be given often. sfms-small; arig-small for the tables of ARIG."
+        [], metavar="NAME|DIR", help="May be repeated. Default: sfms-small, for the tables of ARIG arig-small."
     ),
     data: Path = Option(..., help="Composed dyads, or with --table any data set (see `sfms-robot data check`)."),
     table: Literal["1", "2", "arig-1", "arig-2", "arig-4", "arig-readings"] | None = Option(
-        None, help="Of the SFMS paper: 1 as on L2L, 2 as on REACT. Of the ARIG paper: 2, ablations 1 and 4, readings."
+        None, help="SFMS paper: 1 as on L2L, 2 as on REACT. ARIG paper: 2, ablations 1 and 4, readings."
     ),
     samples: int = Option(10, min=1, help="Answers to every clip, for --table 1 and 2."),
-    clips: int | None = Option(None, min=1, help="At most this many dyads, for --table; all of them."),
+    clips: int | None = Option(None, min=1, help="Most dyads, for --table. Default: all."),
     models: Path | None = Option(
-        None, help="Folder of the papers' listeners as written, and of ablations; those missing are trained."
+        None, help="Folder of the papers' listeners as written and of ablations; missing ones are trained."
     ),
-    config: Path | None = Option(None, help="Training of the ablations; configs/training/arig-as-written.yaml."),
-    steps: int | None = Option(None, min=1, help="Another number of training steps than the file's."),
+    config: Path | None = Option(
+        None, help="Training file of the ablations. Default: configs/training/arig-as-written.yaml."
+    ),
+    steps: int | None = Option(None, min=1, help="Training steps. Default: those of the file."),
     seeds: int = Option(
         1, min=1, help="Trainings of each row of ARIG's tables, except arig-2; three and more say what holds."
     ),
@@ -107,7 +111,7 @@ def listener_(
     order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
-    """Nods, blinks, smiles and smoothness of listeners beside those of the dyads' own; or a table of a paper."""
+    """Compare nods, blinks, smiles and smoothness of listeners with those of the dyads, or make a table of a paper."""
     from sfms_robot.lab.evaluation.listener_tables import evaluate_listener
 
     of_arig = table is not None and table.startswith("arig")
@@ -133,20 +137,20 @@ def listener_(
 def papers(
     data: Path = Option(..., help="Composed dyads."),
     models: Path | None = Option(
-        None, help="Folder of what only tables need; what is missing is trained: hours. Without it: said to be missing."
+        None, help="Folder of listeners and tokenizers for tables; missing ones are trained (hours)."
     ),
     table: list[str] = Option(
-        [], metavar="1|2|3|4|arig-1|arig-2|arig-4|arig-readings", help="May be given often; all of them if not."
+        [], metavar="1|2|3|4|arig-1|arig-2|arig-4|arig-readings", help="May be repeated. Default: all."
     ),
-    clips: int | None = Option(None, min=1, help="At most this many dyads a table; all of them."),
+    clips: int | None = Option(None, min=1, help="Most dyads per table. Default: all."),
     samples: int = Option(10, min=1, help="Answers to every clip of tables 1 and 2."),
-    steps: int | None = Option(None, min=1, help="Another number of steps than the training files'."),
+    steps: int | None = Option(None, min=1, help="Training steps. Default: those of the training files."),
     seeds: int = Option(1, min=1, help="Trainings of each row of ARIG's tables, except arig-2."),
     split: Unseen = SPLIT,
     seed: int = SEED,
     json: bool = JSON,
 ) -> None:
-    """Every table of both papers: the papers as written beside the shipped listeners, and what they report."""
+    """Make every table of both papers: the papers as written, the shipped listeners and the printed figures."""
     from sfms_robot.lab.evaluation.arig_tables import EVERY, TableOptions, evaluate_papers
 
     options = TableOptions(
@@ -161,20 +165,20 @@ def timing(
     listener: str = LISTENER,
     data: Path = Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
     split: Part = Option("test", help="People of the meetings: test to report, validation to choose."),
-    allow_training: bool = Option(False, "--allow-training", help="Play people that listeners learned from."),
-    meetings: int | None = Option(None, min=1, help="At most this many, spread over the people; all of them."),
+    allow_training: bool = Option(False, "--allow-training", help="Allow people that listeners learned from."),
+    meetings: int | None = Option(None, min=1, help="Most meetings, spread over the people. Default: all."),
     minutes: float = Option(
-        5.0, min=0.0, help="Of motion, from the middle of each meeting; 0: hazards and decisions alone, in minutes."
+        5.0, min=0.0, help="Minutes of motion, from the middle of each meeting; 0: only hazards and decisions."
     ),
     seeds: int = Option(8, min=1, help="Number of times that each meeting is played."),
     seed: int = SEED,
     jobs: int | None = JOBS,
     hop: int | None = HOP,
     engine: str = Option("torch", metavar="auto|onnx|torch", help=ENGINE_HELP),
-    own_voice: bool = Option(False, "--own-voice", help="It speaks when the person did; else it never does."),
+    own_voice: bool = Option(False, "--own-voice", help="Let it speak when the person did. Default: it never speaks."),
     json: bool = JSON,
 ) -> None:
-    """Nods, blinks, smiles and gaze shifts of the listener in real meetings, beside those of the people."""
+    """Compare nods, blinks, smiles and gaze shifts of a listener in real meetings with those of the people."""
     from sfms_robot.app.options import engine_named
     from sfms_robot.lab.evaluation.meetings import TimingOptions, evaluate_timing
 
@@ -205,17 +209,17 @@ def timing(
 def robustness(
     listener: str = LISTENER,
     data: Path | None = Option(
-        None, metavar="DIR", help="Folder with more voices (speech_audio, conversation_audio, ...); the bundled ones."
+        None, metavar="DIR", help="Folder with more voices (speech_audio, ...). Default: the bundled ones."
     ),
     split: Part = Option("test", help="People of the voices: test to report, validation to choose."),
-    speakers: int | None = Option(None, min=1, help="At most this many; all of the part."),
-    minutes: float = Option(1.0, min=0.1, help="Of each, in each way."),
-    seeds: int = Option(8, min=1, help="Number of times that each is played."),
+    speakers: int | None = Option(None, min=1, help="Most speakers. Default: all of the part."),
+    minutes: float = Option(1.0, min=0.1, help="Minutes of each speaker in each condition."),
+    seeds: int = Option(8, min=1, help="Number of times that each speaker is played."),
     seed: int = SEED,
     jobs: int | None = JOBS,
     json: bool = JSON,
 ) -> None:
-    """Events a minute with unseen speakers: voice, face and both, in noise, rooms and bad pictures."""
+    """Count events a minute with unseen speakers: voice, face and both, in noise, rooms and bad pictures."""
     from sfms_robot.lab.evaluation.robustness import evaluate_robustness
 
     found = evaluate_robustness(
@@ -228,9 +232,9 @@ def robustness(
 def naturalness(
     listener: str = LISTENER,
     data: Path = Option(..., help="Composed dyads (`sfms-robot data compose`)."),
-    split: str = Option("test", metavar="validation|test", help="People whose motion it is compared with."),
-    clips: int | None = Option(None, min=1, help="At most this many dyads, spread evenly; all of them."),
-    drift: float = Option(600.0, min=30.0, metavar="S", help="Length of the run that is looked at for drift."),
+    split: str = Option("test", metavar="validation|test", help="People whose motion is compared with it."),
+    clips: int | None = Option(None, min=1, help="Most dyads, spread evenly. Default: all."),
+    drift: float = Option(600.0, min=30.0, metavar="S", help="Length of the run that is checked for drift."),
     seed: int = SEED,
     engine: str = Option("auto", metavar="auto|onnx|torch", help=ENGINE_HELP),
     json: bool = JSON,
@@ -250,11 +254,11 @@ def metrics_(
     ),
     speaker: Path | None = Option(None, help="The speakers' motion: for P-FD, RPCC and FRSyn."),
     space: str | None = Option(None, metavar="SPACE", help="arkit58, faceverse58, deca56, attributes25."),
-    frames: int | None = Option(None, min=2, help="Cut clips to so many; default: to the shortest."),
+    frames: int | None = Option(None, min=2, help="Length of clips. Default: that of the shortest."),
     seed: int = SEED,
     json: bool = JSON,
 ) -> None:
-    """The papers' metrics of any motion beside recorded motion: of your own system, from files."""
+    """Compute the papers' metrics of motion from files, such as your own system's, against recorded motion."""
     from sfms_robot.lab.evaluation.motion_metrics import evaluate_metrics
 
     show(
@@ -268,7 +272,7 @@ def metrics_(
 def interaction(
     listener: str = Option("arig-small", help="Shipped listener, or a folder with config.yaml and weights."),
     data: Path = Option(..., help="Composed dyads with interaction/ and speaking/ (`sfms-robot data compose`)."),
-    clips: int | None = Option(None, min=1, help="At most this many dyads of each set; all of them."),
+    clips: int | None = Option(None, min=1, help="Most dyads of each set. Default: all."),
     split: Unseen = SPLIT,
     seed: int = SEED,
     json: bool = JSON,
@@ -282,24 +286,26 @@ def interaction(
 @app.command()
 def people(
     listener: list[str] = Option(
-        [], metavar="NAME|DIR|recorded", help="Two or more: listeners, and what the people of --data did."
+        [], metavar="NAME|DIR|recorded", help="Two or more listeners; recorded: the people of --data."
     ),
     data: Path | None = Option(
         None,
         help="Composed dyads, or any data set with voices; default: bundled voices that no listener was trained on.",
     ),
     split: Unseen = SPLIT,
-    voices: int = Option(8, min=1, help="Voices that each listens to."),
+    voices: int = Option(8, min=1, help="Voices for each listener."),
     seconds: float = Option(12.0, min=2.0, max=60.0, help="Length of a clip."),
     seed: int = SEED,
     out: Path = Option(
         Path("sfms-people"), metavar="DIR", help="The study: clips and answers; continued if it exists."
     ),
-    view: str = Option("auto", metavar="[HOST:]PORT", help="Where the page is; default: this machine alone."),
-    results: Path | None = Option(None, metavar="FILE.csv", help="Serve no page: the table of these answers."),
+    view: str = Option("auto", metavar="[HOST:]PORT", help="Address of the page. Default: only this machine."),
+    results: Path | None = Option(
+        None, metavar="FILE.csv", help="Print the table of these answers without serving a page."
+    ),
     json: bool = JSON,
 ) -> None:
-    """A page that asks people, blind, which of two listens more like a person; Ctrl-C ends it, with a table."""
+    """Serve a blind study: people choose which of two listens more like a person. Ctrl-C prints a table."""
     from sfms_robot.lab.evaluation import people_study
 
     if results is not None:
@@ -318,11 +324,11 @@ def people(
 
 @app.command()
 def fidelity(
-    head: list[str] = Option([], metavar="NAME|DIR", help="May be given often; all shipped heads."),
-    data: Path | None = Option(None, metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    head: list[str] = Option([], metavar="NAME|DIR", help="May be repeated. Default: all shipped heads."),
+    data: Path | None = Option(None, metavar="DIR", help="Face tracks (CSV) instead of the bundled ones."),
     json: bool = JSON,
 ) -> None:
-    """The share of each recorded face's motion that a head can show, on the skin of the virtual head."""
+    """Measure the share of recorded faces' motion that a head can show, on the skin of the virtual head."""
     from sfms_robot.app.head.head_check import fidelity as measure
 
     show(measure(head, data), json)

@@ -14,9 +14,7 @@ from sfms_robot.app.output_paths import checked_png
 from sfms_robot.cli.show import JSON, Result, aside, cell, counted, print_rows, say, show
 from sfms_robot.errors import INTERRUPTED, ConfigError, TorqueError
 
-PACKAGES = Option(
-    [], "--package", metavar="DIR", help="A folder outside the head's that meshes may lie in; may be repeated."
-)
+PACKAGES = Option([], "--package", metavar="DIR", help="Folder with meshes outside the head's folder; may be repeated.")
 NAME = Argument(..., metavar="NAME|DIR", help="A shipped head, or a folder with a head.yaml.")
 YES = Option(False, "--yes", help="Hobby servos may jump to rest when they come on.")
 
@@ -24,7 +22,7 @@ app = Typer(help="Heads: list, check, show, pose, calibrate, fit, solve.", no_ar
 listener = Typer(help="Listeners: list.", no_args_is_help=True)
 speaker = Typer(help="Recorded people: list.", no_args_is_help=True)
 port = Typer(help="Serial ports and sound devices: list.", no_args_is_help=True)
-output = Typer(help="Outputs, heads that take a face or a pose: list.", no_args_is_help=True)
+output = Typer(help="Outputs, which show the face or pose elsewhere: list.", no_args_is_help=True)
 
 
 @listener.callback()
@@ -36,7 +34,7 @@ def _group() -> None: ...
 
 @listener.command("list")
 def list_listeners(json: bool = JSON) -> None:
-    """Shipped listeners: kind, whether it has weights, what it is."""
+    """List shipped listeners: kind, weights and description."""
     from sfms_robot.app.catalogue import shipped_listeners
 
     show({"version": 1, "listeners": shipped_listeners()}, json)
@@ -44,7 +42,7 @@ def list_listeners(json: bool = JSON) -> None:
 
 @speaker.command("list")
 def list_speakers(json: bool = JSON) -> None:
-    """Shipped speakers: seconds, whether there is a face, what it is."""
+    """List shipped speakers: seconds, face and description."""
     from sfms_robot.app.catalogue import shipped_speakers
 
     show({"version": 1, "speakers": shipped_speakers()}, json)
@@ -52,7 +50,7 @@ def list_speakers(json: bool = JSON) -> None:
 
 @output.command("list")
 def list_outputs(json: bool = JSON) -> None:
-    """Kinds of --output, with the address that each takes; those of installed packages too."""
+    """List kinds of --output with their addresses, also those of installed packages."""
     from sfms_robot.app.catalogue import outputs
 
     show({"version": 1, "outputs": outputs()}, json)
@@ -60,7 +58,7 @@ def list_outputs(json: bool = JSON) -> None:
 
 @port.command("list")
 def list_ports(json: bool = JSON) -> None:
-    """Serial ports that servos may hang on, with what speaks against using them; devices that record, or play."""
+    """List serial ports, with problems of each, and devices that record or play sound."""
     from sfms_robot.app.catalogue import ports
 
     show({"version": 1, **ports()}, json)
@@ -68,10 +66,10 @@ def list_ports(json: bool = JSON) -> None:
 
 @app.command("list")
 def list_heads(
-    urdf: Path | None = Option(None, metavar="FILE.png", help="Draw them all."),
+    urdf: Path | None = Option(None, metavar="FILE.png", help="Draw all heads."),
     json: bool = JSON,
 ) -> None:
-    """Shipped heads, with joints and buses."""
+    """List shipped heads, with joints and buses."""
     from sfms_robot.app.catalogue import shipped_heads
 
     if urdf is not None:
@@ -84,13 +82,15 @@ def list_heads(
 @app.command("check")
 def check(
     name: str = NAME,
-    data: Path | None = Option(None, metavar="DIR", help="Face tracks (CSV) in place of the bundled."),
+    data: Path | None = Option(None, metavar="DIR", help="Face tracks (CSV) instead of the bundled ones."),
     plot: Path | None = Option(None, metavar="FILE.png", help="Draw ranges and demands."),
-    listener: str | None = Option(None, metavar="NAME|DIR", help="Also what this listener cannot show."),
+    listener: str | None = Option(
+        None, metavar="NAME|DIR", help="Also list channels of this listener that the head cannot show."
+    ),
     packages: list[str] = PACKAGES,
     json: bool = JSON,
 ) -> None:
-    """Every problem of a head's file at once, or what recorded faces ask of each of its joints."""
+    """Report all problems of a head's file, or the demands of recorded faces on its joints."""
     from sfms_robot.app.head.head_check import check as check_head
     from sfms_robot.app.head.head_check import plot as draw
 
@@ -153,12 +153,12 @@ def show_head(
     name: str = NAME,
     joint: str | None = Option(None, metavar="JOINT", help="Only this joint."),
     urdf: Path | None = Option(
-        None, metavar="FILE.png", help="Draw the robot, and list what its URDF's joints follow."
+        None, metavar="FILE.png", help="Draw the robot, and list the joints that its URDF's joints follow."
     ),
     packages: list[str] = PACKAGES,
     json: bool = JSON,
 ) -> None:
-    """Every value of every joint, and where it comes from: the head's file, or the calibration or fit of this build."""
+    """Show every value of every joint and its source: the head's file, or the calibration or fit of this build."""
     if urdf is not None:
         from sfms_robot.app.head.head_scene import draw_scene
 
@@ -191,12 +191,12 @@ def show_head(
 @app.command("calibrate")
 def calibrate(
     name: str = NAME,
-    port: str = Option(..., help="A serial device, NAME=DEVICE per bus, or 'sim' to practise."),
+    port: str = Option(..., help="Serial device, NAME=DEVICE per bus, or 'sim' to practise."),
     joint: list[str] = Option([], metavar="JOINT", help="Only this joint; may be repeated."),
     again: bool = Option(False, "--again", help="Also joints that are measured already."),
     json: bool = JSON,
 ) -> None:
-    """Lead through the joints of this build: ends, rest, direction. Saved joint by joint, beside the shipped file."""
+    """Measure the joints of this build step by step: ends, rest, direction. Each is saved in an overlay of the file."""
     from sfms_robot.app.head.calibrate import calibrate as lead_through
 
     outcome = lead_through(name, port, partial(print, flush=True), input, joint, again)
@@ -240,9 +240,9 @@ def fit(
     ),
     babble: bool = Option(False, "--babble", help="Move the face within its limits and record it."),
     port: str = Option("sim", help="For --babble: 'sim' (a virtual face), a device, or NAME=DEVICE per bus."),
-    record: Path | None = Option(None, metavar="DIR", help="Where --babble writes to."),
+    record: Path | None = Option(None, metavar="DIR", help="Folder for --babble."),
     minutes: float = Option(2.0, min=0.1, max=60.0, help="Length of --babble."),
-    seed: int = Option(0, min=0, help="Of the random faces of --babble."),
+    seed: int = Option(0, min=0, help="Seed of the random faces of --babble."),
     yes: bool = YES,
     json: bool = JSON,
 ) -> None:
@@ -294,10 +294,10 @@ def solve(
         metavar="FILE.csv",
         help="Columns x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad and, if wanted, body_yaw_rad.",
     ),
-    residual: bool = Option(False, "--residual", help="Also print what is missing: residual_rad,residual_m."),
+    residual: bool = Option(False, "--residual", help="Also print the remaining errors: residual_rad,residual_m."),
     json: bool = JSON,
 ) -> None:
-    """The neck's joints for each pose, as CSV in rad, and whether the pose is reached (1) or only approached (0)."""
+    """Print the neck's joint angles for each pose, as CSV in rad, and whether the pose is reached (1) or not (0)."""
     from sfms_robot.app.head.head_solve import solve_poses
 
     def printed(table: Result) -> None:
@@ -314,11 +314,13 @@ def solve(
 @app.command("import")
 def import_file(
     file: Path = Argument(..., help="LeRobot's calibration JSON, Reachy Mini's hardware_config.yaml, or pypot's JSON."),
-    to: Path | None = Option(None, metavar="DIR", help="New folder; by default one of the file's name, here."),
-    model: str | None = Option(None, help="Of the servos, where the file does not name it (LeRobot)."),
+    to: Path | None = Option(
+        None, metavar="DIR", help="New folder. Default: one named after the file, in the current folder."
+    ),
+    model: str | None = Option(None, help="Model of the servos, if the file does not name it (LeRobot)."),
     json: bool = JSON,
 ) -> None:
-    """Make a head folder from the file of other software, and list what has no place in it."""
+    """Make a head folder from the file of other software, and list values that it cannot hold."""
     from sfms_robot.app.head.head_import import import_head
 
     def printed(imported: Result) -> None:

@@ -123,12 +123,12 @@ def serve(
     metrics: str | None = Option(
         None, metavar="[HOST:]PORT", help="Serve figures for Prometheus at /metrics, on loopback (0: any free port)."
     ),
-    hop: int | None = Option(None, min=1, help="A plan every so many frames. Default: as a robot would choose."),
+    hop: int | None = Option(None, min=1, help="Frames between plans. Default: chosen as on a robot."),
     processes: int | None = Option(
-        None, min=1, max=256, help="Processes, each with the listener in its memory. Default: one for each core."
+        None, min=1, max=256, help="Processes, each with its own copy of the listener. Default: one for each core."
     ),
-    everybody: bool = Option(False, "--everybody", help="Admit robots even if they may not be answered in time."),
-    engine: str = Option("auto", metavar="auto|onnx|torch", help="Engine of the listener, as of `run`."),
+    everybody: bool = Option(False, "--everybody", help="Admit robots even if answers may be late."),
+    engine: str = Option("auto", metavar="auto|onnx|torch", help="Engine of the listener, as in `run`."),
     device: Literal["cpu", "cuda"] = Option("cpu", help="cuda: all heads of a process in one batch on the GPU."),
     json: bool = JSON,
 ) -> None:
@@ -167,7 +167,7 @@ def serve(
 
 def mcp(
     url: str = Option("ws://127.0.0.1:8780", metavar="ws://HOST:PORT", help="The page of a run with --view."),
-    token: str = Option("", help="Printed by the run, where its page is bound beyond loopback."),
+    token: str = Option("", help="Token that the run prints if its page is bound beyond loopback."),
 ) -> None:
     """Serve a running head to an assistant as MCP tools, on stdin and stdout: show, look_at, halt, status, ..."""
     from sfms_robot.agents.mcp import serve as serve_tools

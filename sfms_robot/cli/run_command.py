@@ -23,7 +23,7 @@ OF_SAFETY = partial(Option, rich_help_panel="Safety")
 OUTPUTS = OF_OUTPUT(
     [],
     metavar="KIND[:ADDRESS]",
-    help="Show the face elsewhere too, an avatar or a robot that takes a pose: `output list`; may be repeated.",
+    help="Also show the face on an avatar or a robot that accepts a pose: `output list`; may be repeated.",
 )
 OPTIONAL = {
     "--play": "default",
@@ -36,11 +36,11 @@ def run(
     head: str = OF_HEAD(
         "face28",
         autocompletion=head_names,
-        help="Shipped head, or a folder with a head.yaml; 'none': no servos, --output alone.",
+        help="Shipped head, or a folder with a head.yaml; 'none': no servos, only --output.",
     ),
     port: str = OF_HEAD(
         "sim",
-        help="'sim' for emulated servos, 'auto' for the adapter that is plugged in, a device, or NAME=DEVICE per bus.",
+        help="'sim' for emulated servos, 'auto' for the only adapter, a device, or NAME=DEVICE per bus.",
     ),
     packages: list[str] = PACKAGES,
     intensity: list[str] = OF_HEAD([], metavar="REGION=V", help="Scale of a region's motion, 0 to 2; may be repeated."),
@@ -49,28 +49,28 @@ def run(
         "default",
         autocompletion=speaker_names,
         metavar="mic[:DEVICE]|FILE.wav|NAME|push[:[HOST:]PORT]|browser|ros2:TOPIC|none",
-        help="A microphone (by number, name or part of it: `port list`), a sound file, a shipped speaker, a program of "
-        "yours, the visitor of the page, ROS 2, 'none'. Default: the microphone, with emulated servos a speaker.",
+        help="A microphone (number, name or part of it: `port list`), a sound file, a shipped speaker, your program, "
+        "a visitor of the page, ROS 2, 'none'. Default: the microphone; with emulated servos a shipped speaker.",
     ),
     face: str = OF_PERSON(
         "auto",
         metavar="webcam[:DEVICE]|live-link|vmc|push[:[HOST:]PORT]|browser|ros2:FACE_ID|FILE.csv|none|auto",
-        help="The speaker's face: a camera, a phone (Live Link Face), avatar software (VMC), a program of yours, the "
-        "visitor of the page, ROS 2, a recording (.csv, .csv.gz, .json), 'none'; 'auto': the speaker's, else none.",
+        help="The person's face: a camera, a phone (Live Link Face), avatar software (VMC), your program, a visitor of "
+        "the page, ROS 2, a recording (.csv, .csv.gz, .json), 'none'; 'auto': that of the shipped speaker, else none.",
     ),
     agent_audio: str = OF_PERSON(
         "none",
         autocompletion=speaker_names,
         metavar="FILE.wav|device:DEVICE|NAME|tcp[:[HOST:]PORT]|none",
-        help="The robot's own speech: a sound file, a device that records the loudspeaker, a shipped speaker, a "
-        "program of yours, 'none'. An ARIG listener's lips follow it, and a microphone is rid of it.",
+        help="The robot's own speech: a sound file, a device that records the loudspeaker, a shipped speaker, "
+        "your program, 'none'. An ARIG listener's lips follow it, and it is removed from a microphone.",
     ),
     play: str | None = OF_PERSON(
         None,
         metavar="[DEVICE]",
-        help="Play what the robot says, on a device (by number, name or part of it: `port list`; alone: the default).",
+        help="Play the robot's speech on a device (number, name or part of it: `port list`; alone: the default).",
     ),
-    duration: float | None = OF_PERSON(None, min=0.04, help="Seconds; default: as long as the recording."),
+    duration: float | None = OF_PERSON(None, min=0.04, help="Duration in seconds. Default: that of the recording."),
     listener: str = OF_LISTENER(
         "sfms-small",
         autocompletion=listener_names,
@@ -84,30 +84,30 @@ def run(
     addressed: str = OF_LISTENER(
         "sense",
         metavar="sense|assume|never",
-        help="Is it the head that is spoken to? By the person's look, and yes where no face is seen; always; never.",
+        help="Whether the head is spoken to: sense (by the person's look; yes without a face), assume (always), never.",
     ),
     engine: str = OF_LISTENER(
         "auto",
         metavar="auto|onnx|torch",
-        help="Engine of the listener: onnxruntime, torch; auto: onnxruntime where the listener has graphs for it.",
+        help="Engine of the listener: onnxruntime or torch; auto: onnxruntime if the listener has graphs for it.",
     ),
     seed: int = OF_LISTENER(
         0,
         min=0,
         max=MAX_SEED,
-        help="Two seeds listen differently, one seed repeats (with --fast).",
+        help="Seed of the listener; the same seed repeats a run (with --fast).",
     ),
-    fast: bool = OF_LISTENER(False, "--fast", help="Virtual time: as fast as it goes, bit-identical per --seed."),
+    fast: bool = OF_LISTENER(False, "--fast", help="Virtual time: as fast as possible, bit-identical per --seed."),
     output: list[str] = OUTPUTS,
-    record: Path | None = OF_OUTPUT(None, metavar="DIR", help="Folder to write the run to, for `sfms-robot replay`."),
+    record: Path | None = OF_OUTPUT(None, metavar="DIR", help="Folder to record the run in, for `sfms-robot replay`."),
     record_format: str = OF_OUTPUT(
         "json",
         metavar="json|ros2",
-        help="Messages of the recording (MCAP): JSON, for Foxglove; those of ROS 2, for its tools and PlotJuggler too.",
+        help="Messages of the recording (MCAP): JSON, for Foxglove; ROS 2, also for its tools and PlotJuggler.",
     ),
-    overwrite: bool = OF_OUTPUT(False, "--overwrite", help="Replace the recording that --record's folder holds."),
+    overwrite: bool = OF_OUTPUT(False, "--overwrite", help="Replace an earlier recording in the folder of --record."),
     json: bool = JSON,
-    check: bool = OF_PERSON(False, "--check", help="Judge the sound of --audio for 3 s; no servo moves."),
+    check: bool = OF_PERSON(False, "--check", help="Check the sound of --audio for 3 s; no servo moves."),
     status: str | None = OF_OUTPUT(
         None,
         metavar="[PORT]",
@@ -116,16 +116,16 @@ def run(
     view: str | None = OF_OUTPUT(
         None,
         metavar="[[HOST:]PORT]",
-        help="Serve a page that shows the run, and works it (alone: 127.0.0.1:8780, or the next port that is free).",
+        help="Serve a page that shows and controls the run (without a value: 127.0.0.1:8780, or the next free port).",
     ),
     view_cert: Path | None = OF_OUTPUT(
-        None, metavar="FILE", help="Serve it by https, which a phone's microphone needs: PEM."
+        None, metavar="FILE", help="PEM certificate to serve the page by https, which a phone's microphone needs."
     ),
-    view_key: Path | None = OF_OUTPUT(None, metavar="FILE", help="The key of that certificate: PEM."),
+    view_key: Path | None = OF_OUTPUT(None, metavar="FILE", help="PEM key of this certificate."),
     fleet: str | None = OF_OUTPUT(
         None,
         metavar="NAME",
-        help="Join a fleet as NAME, which sees the run and may halt it: docs/guide/remote.md.",
+        help="Join a fleet as NAME; the fleet sees the run and may halt it (docs/guide/remote.md).",
     ),
     zenoh: Path | None = OF_OUTPUT(
         None,
@@ -136,23 +136,23 @@ def run(
     fleet_key: Path | None = OF_OUTPUT(
         None,
         metavar="FILE",
-        help="Key of the fleet, needed to resume or end the run; made if there is none yet.",
+        help="Key of the fleet, needed to resume or end the run; created if missing.",
     ),
-    dry_run: bool = OF_SAFETY(False, "--dry-run", help="Open and read the servos, never switch torque on."),
+    dry_run: bool = OF_SAFETY(False, "--dry-run", help="Open and read the servos, but never switch torque on."),
     yes: bool = OF_SAFETY(
         False,
         "--yes",
-        help="Hobby servos may jump when they come on: they report no position to begin from.",
+        help="Allow hobby servos to jump when they come on: they report no position.",
     ),
     halt_on: str | None = OF_SAFETY(
         None,
         metavar="FILE|/dev/gpiochipN:LINE",
-        help="Emergency stop when this file appears, or this GPIO line is pulled to ground.",
+        help="Halt when this file appears, or this GPIO line is pulled to ground.",
     ),
     without: list[str] = OF_SAFETY(
         [],
         metavar="JOINT",
-        help="Leave a joint's servo alone (broken, or not there); may be repeated.",
+        help="Joint whose servo is left out (broken or missing); may be repeated.",
     ),
 ) -> None:
     """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
@@ -270,23 +270,25 @@ def _print_run(report: Result) -> None:
 def demo(
     head: str = Option("face28", autocompletion=head_names, help="Shipped head, or a folder with a head.yaml."),
     listener: str = Option("sfms-small", autocompletion=listener_names, help="Shipped listener, or a folder."),
-    seed: int = Option(DEMO_SEED, min=0, max=MAX_SEED, help="Two seeds listen differently."),
-    duration: float | None = Option(None, min=1.0, help="Seconds; default: all that the person says, 47.7."),
-    fast: bool = Option(False, "--fast", help="Virtual time: as fast as it goes."),
-    out: Path | None = Option(
-        None, metavar="DIR", help="Where recording and pictures go; default: runs/demo, runs/demo-2, ..."
+    seed: int = Option(DEMO_SEED, min=0, max=MAX_SEED, help="Seed of the listener."),
+    duration: float | None = Option(
+        None, min=1.0, help="Duration in seconds. Default: all of the person's speech, 47.7."
     ),
-    overwrite: bool = Option(False, "--overwrite", help="Replace the recording that --out holds."),
+    fast: bool = Option(False, "--fast", help="Virtual time: as fast as possible."),
+    out: Path | None = Option(
+        None, metavar="DIR", help="Folder for recording and pictures. Default: runs/demo, runs/demo-2, ..."
+    ),
+    overwrite: bool = Option(False, "--overwrite", help="Replace an earlier recording in --out."),
     seeds: int | None = Option(
-        None, min=1, metavar="N", help="In virtual time: what seeds 0 to N - 1 show, without pictures."
+        None, min=1, metavar="N", help="Compare seeds 0 to N - 1 in virtual time, without pictures."
     ),
     view: str | None = Option(
         None,
         metavar="[[HOST:]PORT]",
-        help="Where the page is that shows it (default: 127.0.0.1:8780, or the next free).",
+        help="Address of the page (default: 127.0.0.1:8780, or the next free port).",
     ),
     output: list[str] = OUTPUTS,
-    no_view: bool = Option(False, "--no-view", help="No page. None is served with --fast, --seeds, --json either."),
+    no_view: bool = Option(False, "--no-view", help="Serve no page, as with --fast, --seeds and --json."),
     json: bool = JSON,
 ) -> None:
     """A recorded person talks, an emulated head listens: on a page while it has visitors, else in two pictures."""
@@ -353,7 +355,7 @@ def replay(
     fast: bool = Option(False, "--fast", help="With --port sim: virtual time."),
     yes: bool = Option(False, "--yes", help="With --port: hobby servos may jump when they come on."),
     view: str | None = Option(
-        None, metavar="[[HOST:]PORT]", help="Put it on a page, to be played there (alone: 127.0.0.1:8780)."
+        None, metavar="[[HOST:]PORT]", help="Serve a page that plays it (without a value: 127.0.0.1:8780)."
     ),
     json: bool = JSON,
 ) -> None:

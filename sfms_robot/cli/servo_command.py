@@ -38,10 +38,10 @@ class Wiring:
     """Location of the servos of a command. Each field is an option of every command."""
 
     port: str | None = Option(None, help="Serial device, or 'sim'. Default: the only one there is.")
-    baud: int | None = Option(None, min=1, help="Look at this rate only. Default: every rate.")
+    baud: int | None = Option(None, min=1, help="Search at this rate only. Default: every rate.")
     family: Family = Option("dynamixel2", help="The protocol of the servos.")
     head: str = Option("face28", help="The head whose servos --port sim emulates.")
-    model: str | None = Option(None, help="Take the servos for this model. Default: by their model number.")
+    model: str | None = Option(None, help="Treat the servos as this model. Default: by their model number.")
     json: bool = JSON
 
     def open(self) -> AbstractContextManager[Wire]:
@@ -58,7 +58,7 @@ class Wiring:
 @with_shared_options
 def scan(
     on: Wiring,
-    ids: str | None = Option(None, help="Ask these one by one, as 1-9,12. Default: all."),
+    ids: str | None = Option(None, help="Ping these ids one by one, as 1-9,12. Default: all."),
 ) -> None:
     """Find the servos on a wire, and their rates."""
     asked = single_servo.checked_ids(ids) if ids is not None else None
@@ -102,7 +102,7 @@ def read(
 def monitor(
     on: Wiring,
     ids: str | None = Argument(None, metavar="ID", help="1-9,12. Default: all."),
-    samples: int | None = Option(None, min=1, help="End after so many samples. Default: Ctrl-C ends."),
+    samples: int | None = Option(None, min=1, help="End after this many samples. Default: Ctrl-C ends."),
     rate: float = Option(5.0, min=0.1, max=50.0, help="Samples per second."),
 ) -> None:
     """Show position, load, voltage, temperature and faults, live. Reads only."""
@@ -124,8 +124,8 @@ def monitor(
 
 @app.command()
 def maps(
-    files: list[Path] = Argument(None, help="Firmware maps of your own, or folders of them, beside the shipped."),
-    check: bool = Option(False, "--check", help="Look for mistakes in the maps; exit code 2 when there are any."),
+    files: list[Path] = Argument(None, help="Your firmware maps, or folders of them, besides the shipped ones."),
+    check: bool = Option(False, "--check", help="Check the maps for mistakes; exit code 2 if there are any."),
     json: bool = JSON,
 ) -> None:
     """List the servo models and boards that have a firmware map."""
@@ -148,10 +148,10 @@ def doctor(
         None, help="Serial device, NAME=DEVICE per bus, or 'sim'. Default: the only one there is."
     ),
     head: str | None = Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
-    baud: int | None = Option(None, min=1, help="Without a head: look at this rate only. Default: every rate."),
+    baud: int | None = Option(None, min=1, help="Without a head: search at this rate only. Default: every rate."),
     family: Family | None = Option(None, help="Without a head: protocol of the servos. Default: dynamixel2."),
     fix: bool = Option(
-        False, "--fix", help="Mend stored values, in the servos or in the head's file; asks before each."
+        False, "--fix", help="Correct stored values, in the servos or in the head's file; asks before each."
     ),
     yes: bool = Option(False, "--yes", "-y", help="With --fix: do not ask."),
     json: bool = JSON,
@@ -180,7 +180,7 @@ def write(
     value: str = Argument(..., help="Raw number, or one with the register's unit: 90deg."),
     yes: bool = YES,
 ) -> None:
-    """Write a register and read it back. EEPROM is asked about first, and refused while torque is on."""
+    """Write a register and read it back. Asks before EEPROM, and refuses it while torque is on."""
     confirm = confirmation(yes, ids)
     _each(ids, on, "written", lambda seen: [single_servo.write_register(seen, register, value, confirm)])
 
@@ -193,7 +193,7 @@ def move(
     to: str | None = Option(None, help="Ticks, or degrees of its shaft: 180deg."),
     by: str | None = Option(None, help="From its present position: ticks, or -5deg."),
 ) -> None:
-    """Move one servo slowly, and leave torque and profile as they were."""
+    """Move one servo slowly, and restore torque and profile."""
     from sfms_robot.app.servo.move import move as go
 
     _each(str(servo), on, "moved", lambda seen: [go(seen, to, by)])
@@ -202,12 +202,12 @@ def move(
 @app.command()
 def release(
     head: str = Option("face28", help="Head whose servos are released."),
-    port: str = Option("auto", help="As of run: DEVICE, BUS=DEVICE[,BUS=DEVICE], auto or sim."),
-    everything: bool = Option(False, "--all", help="Every id on the wires, at the rates of the head."),
+    port: str = Option("auto", help="As in `run`: DEVICE, BUS=DEVICE[,BUS=DEVICE], auto or sim."),
+    everything: bool = Option(False, "--all", help="Release every id on the wires, at the rates of the head."),
     yes: bool = Option(False, "--yes", "-y", help="Do not ask before --all."),
     json: bool = JSON,
 ) -> None:
-    """Take torque off a head's servos, whatever state they are in; the head may fall."""
+    """Switch off the torque of a head's servos, in any state; the head may fall."""
     from sfms_robot.app.servo.move import release_head
 
     if everything and not confirmation(yes)(f"--all takes torque off every servo on {port}"):
@@ -225,7 +225,7 @@ def release(
 @with_shared_options
 def dump(
     on: Wiring,
-    file: Path = Argument(..., help="Is written; must not exist yet."),
+    file: Path = Argument(..., help="File to write; must not exist yet."),
     ids: str | None = Option(None, help="1-9,12. Default: all."),
 ) -> None:
     """Write all registers of servos to a YAML file."""
@@ -241,10 +241,10 @@ def dump(
 @with_shared_options
 def restore(
     on: Wiring,
-    file: Path = Argument(..., help="As `servo dump` wrote it."),
+    file: Path = Argument(..., help="File that `servo dump` wrote."),
     source: int | None = Option(None, "--from", help="Id in the file. Default: each servo of the file."),
     into: int | None = Option(None, help="Id on the wire, with --from. Default: the same."),
-    identity: bool = Option(False, "--identity", help="Give it id and rate of the file as well."),
+    identity: bool = Option(False, "--identity", help="Also write id and rate of the file."),
     yes: bool = YES,
 ) -> None:
     """Write the EEPROM of a dumped servo to one of the same model. Shows the differences and asks."""
@@ -270,12 +270,12 @@ def restore(
 @with_shared_options
 def set_id(
     on: Wiring,
-    old: int = Argument(..., help="The id it has."),
-    new: int = Argument(..., help="The id it gets."),
-    in_chain: bool = Option(False, "--in-chain", help="Other servos may be on the wire meanwhile."),
+    old: int = Argument(..., help="Its present id."),
+    new: int = Argument(..., help="Its new id."),
+    in_chain: bool = Option(False, "--in-chain", help="Allow other servos on the wire."),
     yes: bool = YES,
 ) -> None:
-    """Give a servo another id. Best with that one servo on the wire."""
+    """Change the id of a servo. Best with only this servo on the wire."""
     _each(str(old), on, "servos", lambda seen: [single_servo.set_id(seen, new, confirmation(yes), in_chain).row()])
 
 
@@ -284,10 +284,10 @@ def set_id(
 def set_baud(
     on: Wiring,
     ids: str = IDS,
-    rate: int = Argument(..., metavar="BAUD", help="The rate it gets, bits per second."),
+    rate: int = Argument(..., metavar="BAUD", help="New rate, bits per second."),
     yes: bool = YES,
 ) -> None:
-    """Give servos another rate, and check that they answer at it."""
+    """Change the rate of servos, and check that they answer at it."""
     confirm = confirmation(yes, ids)
     _each(ids, on, "servos", lambda seen: [single_servo.set_baud(seen, rate, confirm).row()])
 
@@ -295,7 +295,7 @@ def set_baud(
 @app.command()
 @with_shared_options
 def reboot(on: Wiring, ids: str = IDS, yes: bool = YES) -> None:
-    """Start servos over: torque goes off, latched hardware errors are cleared."""
+    """Reboot servos: torque goes off, latched hardware errors are cleared."""
     confirm = confirmation(yes, ids)
     _each(ids, on, "servos", lambda seen: [single_servo.reboot(seen, confirm).row()])
 
@@ -306,7 +306,7 @@ def factory_reset(
     on: Wiring,
     servo: int = ONE_ID,
     keep: Literal["all", "keep-id", "keep-id-and-baud"] = Option(
-        "keep-id-and-baud", "--reset", help="The settings that get their factory values."
+        "keep-id-and-baud", "--reset", help="Settings to reset."
     ),
     yes: bool = YES,
 ) -> None:

@@ -22,7 +22,9 @@ else:
     data_commands = Later("sfms_robot.lab.corpora.data_commands")
     train_runs = Later("sfms_robot.lab.learning.train_runs")
 
-app = Typer(help="Train a listener: its tokenizer, its predictor; and when it does what.", no_args_is_help=True)
+app = Typer(
+    help="Train a listener: its tokenizer, its predictor, its hazards and its motion at rest.", no_args_is_help=True
+)
 data_app = Typer(help="Training data: compose dyads, check and convert data sets.", no_args_is_help=True)
 
 _SHOWN = 3  # names shown for a problem; --json has them all
@@ -49,27 +51,25 @@ class PhaseFlags:
     data: Path | None = Option(
         None, help="Folder with train/ and validation/ (see `sfms-robot data compose`), or a `train pack`."
     )
-    out: Path | None = Option(None, help="Folder for config.yaml, weights and checkpoints; `run --listener` takes it.")
+    out: Path | None = Option(None, help="Folder for config.yaml, weights and checkpoints, for `run --listener`.")
     resume: bool = Option(
         False, "--resume", help="Continue from the checkpoint in --out, with the same settings and data."
     )
-    overwrite: bool = Option(False, "--overwrite", help="Train again although --out holds an earlier training.")
+    overwrite: bool = Option(False, "--overwrite", help="Replace an earlier training in --out.")
     device: Literal["auto", "cpu", "cuda"] = Option("auto", help="auto: the GPU if there is one.")
-    steps: int | None = Option(None, min=1, help="Another number of steps than the file's.")
+    steps: int | None = Option(None, min=1, help="Training steps. Default: those of the file.")
     tensorboard: bool | None = Option(
-        None, help="Curves into OUT/tensorboard; without the flag, where tensorboard is installed."
+        None, help="Write curves to OUT/tensorboard. Default: if tensorboard is installed."
     )
     order: Order | None = ORDER
     accumulate: int | None = Option(
-        None, min=1, help="Pieces of a step's batch that each process takes one after the other; saves memory."
+        None, min=1, help="Pieces of a step's batch that each process computes one after the other; saves memory."
     )
-    scratch: Path | None = Option(
-        None, help="Folder for frames that are read from disk as they are drawn, not held in memory."
-    )
+    scratch: Path | None = Option(None, help="Folder for frames, which are then read from disk instead of memory.")
     dry_run: bool = Option(
         False,
         "--dry-run",
-        help="One step of every stage on made-up frames, and what all of it would take; no data needed.",
+        help="Run one step of every stage on made-up frames, and estimate the whole training; needs no data.",
     )
     json: bool = JSON
 
@@ -79,7 +79,7 @@ class PhaseFlags:
 def tokenizer(
     flags: PhaseFlags,
     placement: Literal["exact", "static", "static_paper", "learned"] | None = Option(
-        None, help="Another keyframe placement than the file's, to compare."
+        None, help="Keyframe placement, to compare. Default: that of the file."
     ),
 ) -> None:
     """Phase 1: keyframes, codes and inpainting (reconstruction of listener motion)."""
@@ -139,25 +139,25 @@ def interruptible(train: Callable[[], Report]) -> Report:
 def pack(
     config: Path = CONFIG,
     data: Path = Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`)."),
-    out: Path = Option(..., metavar="FILE", help="The pack, for --data of a training with the same file."),
+    out: Path = Option(..., metavar="FILE", help="Pack to write, for --data of a training with the same file."),
     order: Order | None = ORDER,
     json: bool = JSON,
 ) -> None:
-    """Write what a training reads of its data to one file: a trainer elsewhere begins at once."""
+    """Write the data of a training to one file, with which a trainer on another machine begins at once."""
     show(train_runs.pack_data(config, data, out, order), json)
 
 
 @app.command()
 def events(
     data: Path = Option(..., help="Folder of AMI tables (words, head_gestures, ...; CSV or CSV.gz)."),
-    out: Path | None = Option(None, metavar="FILE", help="Where the hazards go, as YAML."),
+    out: Path | None = Option(None, metavar="FILE", help="YAML file for the hazards."),
     all_series: bool = Option(
         False, "--all-series", help="Learn from all people, to compare; the result has seen the test set."
     ),
-    seed: int = Option(1, min=0, help="Of the steps that are kept, and of the roll-outs."),
+    seed: int = Option(1, min=0, help="Seed of the kept steps and of the roll-outs."),
     json: bool = JSON,
 ) -> None:
-    """When to nod, smile, laugh, look away: hazards of listening people, a minute's work."""
+    """Train the hazards of nods, smiles, laughs and looks on listening people, in about a minute."""
     from sfms_robot.lab.learning.events.event_training import train_events
 
     show(interruptible(lambda: train_events(data, out, all_series, seed)), json)
@@ -165,13 +165,13 @@ def events(
 
 @app.command()
 def idle(
-    listener: str = Option(..., metavar="NAME|DIR", help="One that follows events, trained."),
+    listener: str = Option(..., metavar="NAME|DIR", help="Trained listener that follows events."),
     data: Path = Option(..., help="Folder with train/ and validation/ (see `sfms-robot data compose`)."),
-    clips: int = Option(12, min=1, help="Dyads of training that it listens to."),
-    seed: int = Option(1, min=0, help="Of what it draws."),
+    clips: int = Option(12, min=1, help="Training dyads that it listens to."),
+    seed: int = Option(1, min=0, help="Seed of its draws."),
     json: bool = JSON,
 ) -> None:
-    """The small motion of a resting face that a listener leaves out, into its folder: a minute's work."""
+    """Train the small motion of a resting face that a listener lacks, into its folder, in about a minute."""
     from sfms_robot.lab.learning.idle_fit import train_idle
 
     show(interruptible(lambda: train_idle(listener, data, clips, seed)), json)
@@ -182,31 +182,29 @@ def idle(
 
 @data_app.command()
 def compose(
-    data: Path = Option(..., help="Folder with ami_listener_annotations/ and, if at hand, more voices."),
+    data: Path = Option(..., help="Folder with ami_listener_annotations/ and, if available, more voices."),
     out: Path = Option(..., help="Folder to write train/, validation/ and test/ into."),
-    minutes: float = Option(
-        240.0, min=1.0, help="Minutes of training dyads; all that the tables give if they give less."
-    ),
-    seed: int = Option(1, min=0, help="One seed composes the same dyads."),
-    overwrite: bool = Option(False, "--overwrite", help="Replace the dyads that --out holds."),
+    minutes: float = Option(240.0, min=1.0, help="Minutes of training dyads, or all that the tables allow if fewer."),
+    seed: int = Option(1, min=0, help="Seed; the same seed composes the same dyads."),
+    overwrite: bool = Option(False, "--overwrite", help="Replace earlier dyads in --out."),
     jobs: int = Option(1, min=1, max=64, help="Processes, up to 9; the files are the same with any number."),
     json: bool = JSON,
 ) -> None:
-    """Compose dyads: real listening events (AMI), real motion, real voices, put together."""
+    """Compose dyads from real listening events (AMI), real motion and real voices."""
     composed = data_commands.compose_dyads(data, out, minutes, seed, overwrite, jobs)
     show(composed, json, heading=f"minutes of dyads written to {out}")
 
 
 @data_app.command()
 def check(
-    folder: Path = Argument(..., metavar="DIR", help="A data set, as its authors lay it out."),
+    folder: Path = Argument(..., metavar="DIR", help="Data set, in the layout of its authors."),
     layout: str = LAYOUT,
     order: Order | None = ORDER,
-    window: int = Option(0, min=0, help="Frames that a clip must have."),
+    window: int = Option(0, min=0, help="Fewest frames of a clip."),
     channels: bool = Option(False, "--channels", help="Show the range of every channel."),
     json: bool = JSON,
 ) -> None:
-    """Read a whole data set once: its contents, and everything that is wrong with it."""
+    """Read a whole data set once, and report its contents and all its problems."""
     report = data_commands.check_data(folder, layout, order, window)
     show(report, json, partial(_print_data, channels=channels))
     if not report["usable"]:
@@ -215,8 +213,8 @@ def check(
 
 @data_app.command()
 def convert(
-    folder: Path = Argument(..., metavar="IN", help="A data set, as its authors lay it out."),
-    out: Path = Argument(..., metavar="OUT", help="Folder to write dyads into; must be empty or not there."),
+    folder: Path = Argument(..., metavar="IN", help="Data set, in the layout of its authors."),
+    out: Path = Argument(..., metavar="OUT", help="Folder to write dyads into; must be empty or missing."),
     layout: str = LAYOUT,
     order: Order | None = ORDER,
     flame_matrix: Path | None = Option(
@@ -225,7 +223,7 @@ def convert(
     flame_order: str = Option("alphabetical", help="Order of the matrix's rows: alphabetical, apple, ..."),
     json: bool = JSON,
 ) -> None:
-    """Convert a data set into dyads at 25 fps in our own space, and report the loss."""
+    """Convert a data set to dyads at 25 fps in this project's space, and report the loss."""
     show(data_commands.convert_data(folder, out, layout, order, flame_matrix, flame_order), json, _print_conversion)
 
 
@@ -302,7 +300,7 @@ def export(
     out: Path | None = Option(None, metavar="DIR", help="Write below this folder. Default: the listener's own."),
     int8: bool = Option(False, "--int8", help="Also with large layers in 8 bits (kind: arig), for large models."),
     weight_bits: int | None = Option(
-        None, metavar="8|16|32", help="Also write the weights, in so many bits. Default: leave them."
+        None, metavar="8|16|32", help="Also write the weights, in this many bits. Default: leave them."
     ),
     json: bool = JSON,
 ) -> None:
