@@ -38,7 +38,7 @@ def bench(
     ),
     json: bool = JSON,
 ) -> None:
-    """Measure, each figure beside that of a peer in the same run. Exit code 1: a figure misses its limit."""
+    """Measure speeds, each compared with a peer in the same run. Exit code 1: a figure misses its limit."""
     from sfms_robot.app.output_paths import checked_file
     from sfms_robot.lab.bench import run_bench
 

@@ -132,7 +132,7 @@ def serve(
     device: Literal["cpu", "cuda"] = Option("cpu", help="cuda: all heads of a process in one batch on the GPU."),
     json: bool = JSON,
 ) -> None:
-    """Serve a listener to robots elsewhere, `sfms-robot run --listener zenoh/NAME`, until Ctrl-C."""
+    """Serve a listener to robots on other machines (`sfms-robot run --listener zenoh/NAME`) until Ctrl-C."""
     from sfms_robot.app.options import engine_named
     from sfms_robot.app.serve.batch_process import Served
     from sfms_robot.app.serve.service import serve as serve_until

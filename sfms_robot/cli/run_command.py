@@ -155,7 +155,7 @@ def run(
         help="Joint whose servo is left out (broken or missing); may be repeated.",
     ),
 ) -> None:
-    """Let a head listen: a voice (and a face, where there is one) goes in, servo goals go out."""
+    """Run a head that listens: reads a person's voice, and face if there is one, and drives the servos."""
     from sfms_robot.app.options import (
         RunOptions,
         begin_listening,
@@ -291,7 +291,7 @@ def demo(
     no_view: bool = Option(False, "--no-view", help="Serve no page, as with --fast, --seeds and --json."),
     json: bool = JSON,
 ) -> None:
-    """A recorded person talks, an emulated head listens: on a page while it has visitors, else in two pictures."""
+    """Show an emulated head that listens to a recorded person, on a page, or in two pictures without visitors."""
     from sfms_robot.app.options import RunOptions, begin_page, check_names
 
     options = RunOptions(

@@ -37,7 +37,7 @@ YES = Option(False, "--yes", "-y", help="Do not ask before EEPROM is written.")
 class Wiring:
     """Location of the servos of a command. Each field is an option of every command."""
 
-    port: str | None = Option(None, help="Serial device, or 'sim'. Default: the only one there is.")
+    port: str | None = Option(None, help="Serial device, or 'sim'. Default: the only one found.")
     baud: int | None = Option(None, min=1, help="Search at this rate only. Default: every rate.")
     family: Family = Option("dynamixel2", help="The protocol of the servos.")
     head: str = Option("face28", help="The head whose servos --port sim emulates.")
@@ -144,9 +144,7 @@ def maps(
 
 
 def doctor(
-    port: str | None = Option(
-        None, help="Serial device, NAME=DEVICE per bus, or 'sim'. Default: the only one there is."
-    ),
+    port: str | None = Option(None, help="Serial device, NAME=DEVICE per bus, or 'sim'. Default: the only one found."),
     head: str | None = Option(None, help="Compare with this head: shipped name, or a folder with a head.yaml."),
     baud: int | None = Option(None, min=1, help="Without a head: search at this rate only. Default: every rate."),
     family: Family | None = Option(None, help="Without a head: protocol of the servos. Default: dynamixel2."),
@@ -156,7 +154,7 @@ def doctor(
     yes: bool = Option(False, "--yes", "-y", help="With --fix: do not ask."),
     json: bool = JSON,
 ) -> None:
-    """Look before you run: port, adapter, every servo, its stored values, wire budget. Reads only, except with --fix.
+    """Check port, adapter, every servo, its stored values and the wire budget. Only reads, except with --fix.
 
     Exit code 0: fit to run. 3: the port cannot be opened. 4: a finding stops the head from running.
     """

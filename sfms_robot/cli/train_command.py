@@ -306,7 +306,7 @@ def export(
 ) -> None:
     """Write a listener's networks as ONNX graphs, which run without torch. Takes a minute.
 
-    They hold no weights: trained again for the same configuration, a listener needs no new ones. In 8 bits weights take
+    Graphs hold no weights, so training again with the same configuration needs no new ones. Weights in 8 bits take
     a quarter of the room; every engine computes with them as real numbers.
     """
     from sfms_robot.app.catalogue import export_listener
