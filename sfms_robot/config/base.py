@@ -30,7 +30,7 @@ from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import ConfigError, InputError, did_you_mean, not_one_of
 
-DEEPEST: Final = 100  # levels; libyaml's composer is recursive, and ends the process at some 10,000 levels
+DEEPEST: Final = 100  # levels of nesting; libyaml's composer is recursive and crashes at about 10,000 levels
 _LEADING_ZERO: Final = "!leading-zero"
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -49,7 +49,7 @@ def _printable(text: str) -> str:
 PRINTABLE: Final = AfterValidator(_printable)
 
 
-Problems = Iterator[str]  # one line each
+Problems = Iterator[str]  # one line per problem
 
 
 class Model(BaseModel):
@@ -63,7 +63,7 @@ class Model(BaseModel):
         """Report unknown keys with the known ones, and then the other problems of the section."""
         found = []
         for key, given in value.items() if isinstance(value, dict) else ():
-            if isinstance(key, (int, float)) and given is None:  # from 25,5 in a list of keys
+            if isinstance(key, (int, float)) and given is None:  # from {min_deg: 25,5}
                 found.append(f"{key} stands alone, without a key: a decimal number is written with a point, as 25.5")
             elif key not in cls.model_fields:
                 found.append(not_one_of(key, "a known key", cls.model_fields))
@@ -130,7 +130,7 @@ def one_line(problem: ErrorDetails) -> str:
     key = ".".join(map(str, problem["loc"]))
     text = problem["msg"].removeprefix("Value error, ")
     value = problem["input"]
-    if problem["type"] in ("model_type", "dict_type"):  # pydantic's text names the class
+    if problem["type"] in ("model_type", "dict_type"):  # pydantic's message names the Python class
         text = "expected keys with values, as key: value"
         text += ", got a list: leave out the dashes" if isinstance(value, list) else ""
     elif problem["type"] == "literal_error":
@@ -141,13 +141,13 @@ def one_line(problem: ErrorDetails) -> str:
     return f"{key}{shown}: {text}" if key else text
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # libyaml's is ten times faster
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # libyaml: ten times faster
     """Safe loader that refuses a key given twice instead of keeping the last value."""
 
-    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}  # none of YAML 1.1
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {}  # without those of YAML 1.1
 
 
-# YAML 1.2.2, section 10.3.2; a scalar is looked up by its first character
+# YAML 1.2.2, section 10.3.2; the resolvers of a scalar are looked up by its first character
 for _tag, _pattern, _first in (
     ("tag:yaml.org,2002:null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     ("tag:yaml.org,2002:bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
@@ -212,7 +212,7 @@ def read(file: Path) -> Any:
 
 
 def with_number(text: str, keys: Sequence[str], value: int) -> str:
-    """Return `text` with `value` under a path of mapping keys; comments, order and all other values stay.
+    """Return `text` with `value` under a path of mapping keys; comments, order and all other values stay unchanged.
 
     Edits only the text: aliases and merge keys are not followed, so the caller has to check the meaning of the result.
     """
@@ -224,7 +224,7 @@ def with_number(text: str, keys: Sequence[str], value: int) -> str:
     for key in reversed(missing):
         new = f"{{{key}: {new}}}"
     start, end = node.start_mark.index, node.end_mark.index
-    if isinstance(node, yaml.MappingNode):  # becomes its first entry
+    if isinstance(node, yaml.MappingNode):  # the value becomes its first entry
         start = end = start + node.flow_style
         new = new[1:-1] + (", " if node.flow_style else f"\n{' ' * node.start_mark.column}")
     return text[:start] + new + text[end:]

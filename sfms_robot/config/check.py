@@ -20,7 +20,7 @@ from sfms_robot.config.overlay import load_overlay
 from sfms_robot.data import head_file
 from sfms_robot.errors import ConfigError
 
-_SMALL_DEG: Final = 6.3  # a smaller range may be given in radians, where a whole turn is 6.28
+_SMALL_DEG: Final = 6.3  # a smaller range may have been written in radians, where a whole turn is 6.28
 _HARMLESS: Final = re.compile(r"(\w+_)?gain|profile_\w+|acceleration|punch|led|c?cw_compliance_(margin|slope)")
 
 
@@ -48,7 +48,7 @@ def _servos(head: Head) -> Problems:
             table = load_firmware_map(joint.model)
         except ConfigError as error:
             alike = [other for other, one in head.joints.items() if one.model == joint.model]
-            if alike[0] == name:  # one line for all joints of the model
+            if alike[0] == name:  # report a model once, with all of its joints
                 yield f"joints.{', '.join(alike)}: {str(error).removeprefix('firmware_maps: ')}"
             continue
         family = f"{table.family}{table.protocol}" if table.family == "dynamixel" else table.family
@@ -74,11 +74,11 @@ def remarks(head: Head) -> list[str]:
 
 
 def is_harmless(table: FirmwareMap, name: str) -> bool:
-    """Return whether a run may write this register without a question: it is in RAM and harmless.
+    """Return whether a run may write this register without confirmation: it is in RAM and harmless.
 
-    `safety.registers` is written before torque comes on, in every run, without a question. It therefore holds only
-    values that are lost when the supply is switched off and are harmless: gains, profiles, compliance, LED. Id,
-    direction and range are stored permanently; a head may list under `safety.stored` the values that it expects, and a
+    Every run writes `safety.registers` before torque comes on, without confirmation. The section may therefore hold
+    only values that are harmless and are lost when the supply is switched off: gains, profiles, compliance, LED. Id,
+    direction and range are stored permanently. A head may list the expected values of these under `safety.stored`; a
     run compares them but never writes them. Goals, torque, modes and limits are set by the run itself.
     """
     register = table.registers[name]

@@ -37,9 +37,9 @@ def _wiring(head: Any) -> Problems:
 
 
 def highest_rate_hz(family: str, baud: int, joints: int) -> float:
-    """Return how often per second goals for `joints` servos fit on a wire of `baud`, without answers.
+    """Return the highest rate at which goals for `joints` servos fit on a wire of `baud`, without answers.
 
-    A whole number, at most 1000. A board sends the changes when its wire is free, so its wire sets no limit.
+    The rate is a whole number, at most 1000. A board sends changes when its wire is free, so its wire sets no limit.
     """
     framing = FRAMINGS.get(family)
     if framing is None or not framing.answer:
@@ -85,7 +85,7 @@ def _drives(head: Any) -> Problems:
         elif other.unit != joint.unit:
             yield f"joints.{name}.unit = {joint.unit!r} is not that of {twin} ({other.unit})"
     uses = {name: {node.use for node in tree.nodes() if node.use} for name, tree in head.expressions.items()}
-    sizes: dict[str | None, int] = {}  # nodes of shared expressions, with those of the expressions that they use
+    sizes: dict[str | None, int] = {}  # nodes of shared expressions, including those of the expressions that they use
     try:
         for used in TopologicalSorter(uses).static_order():
             sizes[used] = _size(head.expressions[used], sizes) if used in head.expressions else 0

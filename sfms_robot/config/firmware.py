@@ -1,7 +1,7 @@
 """A servo model's control table as data, one YAML file per model.
 
 A file is refused if its registers overlap or do not fit their size, or if a role names a register that does not exist,
-so that code after the loader need not check. A model whose table changed with its firmware has one file per layout
+so that code after the loader need not check them. A model whose table changed with its firmware has one file per layout
 (`xl330-m288.yaml`, `xl330-m288_fw52.yaml`): `variant` chooses the layout by the number read from the servo.
 """
 
@@ -34,10 +34,10 @@ Bit = Annotated[int, Field(ge=0, le=15)]
 
 
 class Register(Model):
-    """One row of a control table. `scale` turns the value into `unit`.
+    """One register, a row of a control table. Its value times `scale` is in `unit`.
 
-    `signed` says how negative values are written: `twos_complement`; `sign_bit_N`, where bit N set is minus and the
-    bits below are the magnitude; `offset_2048`, where 2048 stands for zero. `min`, `max` and `initial` come after it.
+    `signed` is the encoding of negative values: `twos_complement`; `sign_bit_N`, where bit N is set for minus and the
+    bits below are the magnitude; `offset_2048`, where 2048 stands for zero. `min`, `max` and `initial` are decoded.
     """
 
     address: int = Field(ge=0, le=65535)
@@ -53,7 +53,7 @@ class Register(Model):
 
     @property
     def held(self) -> tuple[int, int]:
-        """Smallest and largest value that its bytes hold under its sign rule."""
+        """Smallest and largest value that the bytes can hold under the sign rule."""
         if self.signed == "twos_complement":
             half = 1 << 8 * self.size - 1
             return -half, half - 1
@@ -67,18 +67,18 @@ class Register(Model):
     @computed_field  # type: ignore[prop-decorator]  # mypy has no rule for decorated properties
     @property
     def low(self) -> int:
-        """Smallest value it takes: `min`, else what its bytes hold."""
+        """Smallest allowed value: `min`, or else the smallest that the bytes can hold."""
         return self.held[0] if self.min is None else self.min
 
     @computed_field  # type: ignore[prop-decorator]
     @property
     def high(self) -> int:
-        """Largest value it takes: `max`, else what its bytes hold."""
+        """Largest allowed value: `max`, or else the largest that the bytes can hold."""
         return self.held[1] if self.max is None else self.max
 
     @property
     def end(self) -> int:
-        """The address after its last byte."""
+        """Address after the last byte."""
         return self.address + self.size
 
     def problems(self) -> Problems:
@@ -100,7 +100,7 @@ class Register(Model):
 
 
 class FirmwareRange(Model):
-    """The firmware versions that a map holds for; an end left out is open."""
+    """Firmware versions for which a map is valid; an end that is left out is open."""
 
     min: int = Field(default=0, ge=0, le=255)
     max: int = Field(default=255, ge=0, le=255)
@@ -114,7 +114,7 @@ class FirmwareRange(Model):
 
 
 class PulseRange(Model):
-    """Pulse widths that a hobby-servo board produces, microseconds."""
+    """Pulse widths that a hobby-servo board produces, in microseconds."""
 
     min: Positive
     max: Positive
@@ -134,8 +134,8 @@ class FirmwareMap(Model):
     protocol: Literal[1, 2] | None = None
     byte_order: Literal["little", "big"] = "little"
     firmware: FirmwareRange = FirmwareRange()
-    variant_of: str | None = None  # the model of which this is the layout of another firmware
-    same_number_as: str | None = None  # a model with the same number
+    variant_of: str | None = None  # the model that has this layout under another firmware
+    same_number_as: str | None = None  # another model with the same model number
     source: str = Field(min_length=1)
     ticks_per_revolution: Positive
     center_ticks: int
@@ -143,12 +143,12 @@ class FirmwareMap(Model):
     watchdog: Literal["stops", "flags_only", "none"] = "none"  # reaction of the servo to a silent host
     position_mode: int | None = None  # value of role operating_mode for position control
     baud_codes: dict[int, PositiveInt] = {}  # code in role baud_rate -> bit/s
-    faults: dict[Bit, str] = {}  # bit of role error_status, or of a board's error word
-    status_faults: dict[Bit, str] = {}  # bit of the error byte of every status packet
+    faults: dict[Bit, str] = {}  # bit of role error_status, or of a board's error word -> fault
+    status_faults: dict[Bit, str] = {}  # bit of the error byte of every status packet -> fault
     channels: int | None = Field(default=None, gt=0, le=255)
     pulse_us: PulseRange | None = None
     tick_us: Positive | None = None
-    roles: dict[Role, Name | None] = {}  # registers whose name is not that of their role
+    roles: dict[Role, Name | None] = {}  # role -> register, where the names differ; None: no such register
     registers: dict[Name, Register] = {}
 
     def contradictions(self) -> Problems:
@@ -156,7 +156,7 @@ class FirmwareMap(Model):
             yield "; ".join(problems)
 
     def _shape(self) -> Problems:
-        """Yield keys of a board in a servo's map, and the reverse."""
+        """Yield a wrong protocol, keys of a board in a servo's map, and the reverse."""
         allowed = {"dynamixel": (1, 2), "feetech": (1,)}.get(self.family, (None,))
         if self.protocol not in allowed:
             yield f"protocol = {self.protocol} is not one of family {self.family} ({', '.join(map(str, allowed))})"
@@ -173,7 +173,7 @@ class FirmwareMap(Model):
             yield f"registers: a {self.family} board has none" if board else "registers is empty"
 
     def _layout(self) -> Problems:
-        """Yield registers that overlap, leave the address space, or cannot hold their values."""
+        """Yield registers that overlap, exceed the address space, or cannot hold their values."""
         end, last = 0, ""
         wide = any(register.size == 4 for register in self.registers.values())
         space = 65536 if self.protocol == 2 else 256  # one address byte in the frame of protocol 1 and Feetech
@@ -183,7 +183,7 @@ class FirmwareMap(Model):
             if register.end > space:
                 yield f"registers.{name}.address = {register.address} ends past the address space ({space} bytes)"
             if wide and register.size > 1 and register.address % 2:
-                # Tables with 4-byte registers are read as words inside the servo: an odd address is a mistake.
+                # A servo whose table has 4-byte registers reads it in words, so an odd address is a mistake.
                 yield f"registers.{name}.address = {register.address} is odd, which {register.size} bytes cannot be"
             yield from (f"registers.{name}.{problem}" for problem in register.problems())
             end, last = max(end, register.end), name
@@ -204,12 +204,12 @@ def user_maps() -> Path:
 
 
 def map_files() -> list[Path]:
-    """Return every shipped firmware map, sorted, and then those of the user."""
+    """Return all shipped firmware maps, sorted, and then those of the user."""
     return [*sorted(data_dir("firmware_maps").glob("*/*.yaml")), *sorted(user_maps().glob("**/*.yaml"))]
 
 
 def model_name(text: str) -> str:
-    """Return the name of a servo model's map: in lower case, without the -T or -R of its connector."""
+    """Return the name of a servo model's map: in lower case, without the suffix -T or -R for its connector."""
     name = text.lower()
     return text if name.endswith(".yaml") else name if name.endswith("-1.0") else re.sub("-[tr]$", "", name)
 

@@ -1,4 +1,4 @@
-"""A head: joints, the servos that move them, how far and fast they may go, and what drives them."""
+"""A head: joints, the servos that move them, their ranges and limits, and the channels that drive them."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from sfms_robot.errors import not_one_of
 from sfms_robot.frames import LATERAL_POSE, Doubles
 from sfms_robot.ranges import Range
 
-VERSION: Final = 1  # version of the format of a head's file
-NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # keys not taken over from a twin
-TRAVEL: Final = 0.2  # share of the travel, around rest, of a joint that must be calibrated first
+VERSION: Final = 1  # version of the format of head files
+NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # keys that a twin does not pass on
+TRAVEL: Final = 0.2  # share of its travel, around rest, that a joint may use before it is calibrated
 PACE: Final = 0.3
 _SUFFIX: Final = "_calibrate_first"
 
 
 class CameraMount(Model):
-    """A camera and its direction; axes are the head's, x forward, y left, z up.
+    """Place and direction of the camera that sees people; the axes are the head's: x forward, y left, z up.
 
     Attributes:
-        on: `head` moves with the neck; `base` stays.
-        at_m: its place, from the middle of the head at home.
-        rpy_deg: how it is turned, roll, pitch (+ down) and yaw (+ left); zero looks ahead.
+        on: `head`: the camera moves with the neck; `base`: it stays.
+        at_m: place of the camera, from the middle of the head at home.
+        rpy_deg: rotation of the camera: roll, pitch (+ down) and yaw (+ left); at zero it looks ahead.
     """
 
     on: Literal["head", "base"]
@@ -51,15 +51,15 @@ class CameraMount(Model):
 
 
 class Gaze(Model):
-    """Eyes that hold and jump.
+    """Eyes that hold a point while the head moves, and jump to the next one.
 
     Attributes:
-        neck_gain: share of the head's yaw and pitch that the eyes turn against (vestibulo-ocular).
-        dead_zone_deg: gaze is held until its target is this far away.
-        recentre_deg: how far the eyes may be turned from their target by compensating, then they jump back.
-        settle_ms: the target has to be away for this long before the eyes follow.
-        pause_ms: shortest hold between two jumps.
-        full_yaw_deg, full_pitch_deg: the eye's angle for a channel of 1.
+        neck_gain: share of the head's yaw and pitch that the eyes compensate for (vestibulo-ocular reflex).
+        dead_zone_deg: the eyes hold their point until the listener's gaze is this far away from it.
+        recentre_deg: largest angle from the listener's gaze that compensation may cause; beyond it the eyes jump back.
+        settle_ms: time that the listener's gaze has to be away before the eyes follow.
+        pause_ms: shortest time between two jumps.
+        full_yaw_deg, full_pitch_deg: angle of the eye at a value of 1 of its eyeLook channel.
     """
 
     neck_gain: Share = 1.0
@@ -77,14 +77,14 @@ class Gaze(Model):
 
 
 class Idle(Model):
-    """Small motion where the listener gives none. 0 leaves a kind out.
+    """Blinks, sway and glances where the listener makes none. 0 switches a kind off.
 
     Attributes:
-        blinks_per_minute: wanted in all, those of the listener counted.
-        head_deg: half the swing of yaw; pitch and roll swing less.
-        glance_deg: how far the eyes wander, for a head that is given no gaze.
-        still_deg_s: a head or eyes slower than this are not being moved by the listener.
-        fade_s: how long the listener has to be still before idle motion is back in full.
+        blinks_per_minute: wanted number of blinks, including those of the listener.
+        head_deg: half the swing of the yaw; pitch and roll swing less.
+        glance_deg: largest turn of the eyes to the side in a glance, while the listener does not move them.
+        still_deg_s: head or eyes that the listener turns more slowly than this count as still.
+        fade_s: time that the listener has to be still until idle motion is back in full.
     """
 
     blinks_per_minute: float = Field(default=14.0, ge=0, le=60)
@@ -95,12 +95,12 @@ class Idle(Model):
 
 
 class Person(Model):
-    """Looking at the person that the head listens to, and away as people do.
+    """Looking at the person that the head listens to, and looking away as people do.
 
     Attributes:
-        head_share: of the direction to a person, the part that the neck turns; the eyes keep the rest. A head that is
-            given no gaze turns its neck all the way.
-        look_away: how often the head looks away, people being 1; 0 is never.
+        head_share: share of the direction to the person that the neck turns; the eyes turn the rest. A head without a
+            `gaze` section turns its neck all the way.
+        look_away: rate of looks away from the person: 1 is as often as people, 0 is never.
     """
 
     head_share: Share = 0.6
@@ -108,7 +108,7 @@ class Person(Model):
 
 
 class Life(Model):
-    """Spontaneous motion. All sections are optional; one that is left out does nothing."""
+    """Spontaneous motion of a head. All sections are optional; a section that is left out adds no motion."""
 
     gaze: Gaze | None = None
     idle: Idle | None = None
@@ -116,9 +116,9 @@ class Life(Model):
 
 
 class FollowingJoint(Model):
-    """One joint of the URDF: its value is `offset` + `scale` x our joint's angle [rad].
+    """A joint of the URDF that follows a joint of the head: its value is `offset` + `scale` x that joint's angle [rad].
 
-    `scale` is 1 or -1 for a joint that turns as ours does, metres per radian for one that slides.
+    `scale` is 1 or -1 for a joint that turns like the head's joint, and metres per radian for a sliding joint.
     """
 
     joint: str = Field(min_length=1)
@@ -127,11 +127,11 @@ class FollowingJoint(Model):
 
 
 class RobotDescription(Model):
-    """A URDF file, or the name of a shipped head with the same look.
+    """Appearance of a head: a URDF file, or the name of a shipped head that looks the same.
 
     Attributes:
-        packages: where the folders of `package://NAME/...` lie, from the head's folder on.
-        joints: our joint -> joint of the URDF; one that is not named here drives the joint of its own name.
+        packages: folder of each package in `package://NAME/...`, relative to the head's folder.
+        joints: joint of the head -> joint of the URDF; a joint that is not named here moves the URDF joint of its name.
     """
 
     file: str = Field(min_length=1)
@@ -153,8 +153,8 @@ class RobotDescription(Model):
 class Head(Model):
     """A head: `configs/heads/NAME/head.yaml`.
 
-    `calibrate_first`: zeros and ranges differ from build to build, so that on real servos the head moves little and
-    slowly until they have been measured.
+    `calibrate_first`: true for a head whose zeros and ranges differ from build to build. On real servos it moves little
+    and slowly until they have been measured.
     """
 
     version: int = Field(default=VERSION, ge=1, le=VERSION)
@@ -179,7 +179,7 @@ class Head(Model):
 
     @property
     def folder(self) -> Path | None:
-        """Folder of its file; None for a head that was made otherwise."""
+        """Folder of the head's file; None for a head that was not loaded from a file."""
         return self._folder
 
     @model_validator(mode="wrap")
@@ -217,7 +217,7 @@ class Head(Model):
 def load_head(name: str, *, servos: bool = True) -> Head:
     """Return a head by shipped name or folder. Raises ConfigError.
 
-    `servos` False: accept also `NO_HEAD`, a head without servos.
+    If `servos` is False, `NO_HEAD`, a head without servos, is accepted too.
     """
     if name == NO_HEAD and not servos:
         return Head.model_construct(name=NO_HEAD, description="No servos", buses={}, limits={}, joints={})
@@ -232,7 +232,8 @@ def expanded(raw: Any) -> Any:
 
     A mirrored drive is the same drive with left and right exchanged. Channels that end in Left or Right change places;
     roll, yaw and y, which have one channel for both sides, change sign. A joint whose plus points to the same side of
-    the head as that of its twin (pan, say) is of the opposite sense: its drive, and its range, are negated as well.
+    the head as the plus of its twin (pan, for example) has `mirror_sense: opposite`: its drive and range are negated
+    as well.
 
     A value of the wrong type stays unchanged, and the models refuse it. Raises ValueError for a newer version, and for
     a twin that does not exist.
@@ -271,7 +272,7 @@ def held_back(head: Head, joints: Iterable[str]) -> Head:
     """Return the head with `joints` at 20 % of their travel and 0.3 of their limits.
 
     Servo horns sit differently on every build, so a face that moves as its file says may drive a lip into the teeth.
-    A joint whose zero and range have not been measured therefore keeps near its rest and moves slowly.
+    A joint whose zero and range have not been measured therefore stays near its rest and moves slowly.
     """
     limits, held = dict(head.limits), dict(head.joints)
     for name in joints:
@@ -338,8 +339,8 @@ def other_side(channel: str) -> str:
 class StoredRegisters(Model):
     """The registers and supply of an emulated head's servos: `configs/heads/NAME/emulate.yaml`.
 
-    In a real head homing offsets, limits and the like have been written into the servos before; emulated ones get them
-    from here. `registers` holds for every servo of the head, `joints` for one; raw values by register name.
+    The servos of a real head already store homing offsets, limits and the like; emulated servos get them from this
+    file. `registers` applies to every servo, `joints` to the servo of one joint; raw values by register name.
     """
 
     source: str = ""
@@ -353,6 +354,6 @@ class StoredRegisters(Model):
 
 
 def load_stored(head: Head) -> StoredRegisters:
-    """Return the stored registers of a head, from its folder; without a file, those of a new servo."""
+    """Return the stored registers of a head from its folder; without such a file, those of new servos."""
     file = head.folder and head.folder / "emulate.yaml"
     return load(StoredRegisters, file) if file and file.is_file() else StoredRegisters()

@@ -4,7 +4,7 @@ A sound comes at any time within a hop, and reaches the goals after
 
     0 .. hop T      until the end of the frame with which the next plan is made
     source          until that frame is complete, and the next tick passes it to the listener
-    step            until the plan is made, and the next tick has the first goals of it
+    step            until the plan is made, and the next tick has its first goals
     T               more if a plan is a single frame, which is played one frame late (`motion.timeline`)
 
 Half of all sounds come in the later half of a hop, so p50 is the time of a sound 0.5 hop T before its end, and p95 of
@@ -24,8 +24,8 @@ from typing import Final
 from sfms_robot.frames import FRAME_S
 
 STEP_S: Final = 0.025  # longest computation of a plan (99th percentile, paper size, two CPU cores)
-LEAD_S: Final = 0.080  # longest lead of a joint: the slowest servo's lag and a tick
-P50_S: Final = 0.095  # wanted time from a sound to the first goal of a plan made with it
+LEAD_S: Final = 0.080  # longest lead of a joint: the lag of the slowest servo plus a tick
+P50_S: Final = 0.095  # wanted median time from a sound to the first goal of a plan made with it
 P95_S: Final = 0.135
 _EPS_S: Final = 1e-9
 
@@ -73,11 +73,11 @@ class Latencies:
         return self.goal_s(hop, 0.95, self.step_p99_s)
 
     def left_s(self, hop: int) -> float:
-        """Return the time left of a plan when the next one comes; negative if it has run out by then."""
+        """Return the time that is left of a plan when the next one comes; negative if the plan has run out by then."""
         return (max(self.horizon - 1, 1) - hop) * FRAME_S - self.source_s - self.step_p99_s
 
     def fits(self, hop: int) -> bool:
-        """Return whether the leads have room, sounds are answered in time, and the listener keeps up."""
+        """Return whether plans leave room for the leads, sounds are answered in time, and the listener keeps up."""
         return not self.given_up(hop)
 
     def given_up(self, hop: int) -> list[str]:
@@ -101,7 +101,7 @@ class Latencies:
     def keeps_up(self, hop: int) -> bool:
         """Return whether a plan takes at most half of its hop (median), and at most all of it (99th percentile).
 
-        The rest of the time is for catching up with the sound that came while graphs were built.
+        The rest of the time is needed to catch up with the sound that came while graphs were built.
         """
         return self.step_p50_s <= hop * FRAME_S / 2 and self.step_p99_s <= hop * FRAME_S
 
@@ -118,7 +118,7 @@ class HopChoice:
 def default_hop(horizon: int) -> int:
     """Return the largest hop with hop T + step + lead <= (H - 1) T, at least 1.
 
-    For virtual time and training, without measurements.
+    Used in virtual time and in training, where nothing is measured.
     """
     return max(1, math.floor((horizon - 1) - (STEP_S + LEAD_S) / FRAME_S + _EPS_S))
 
@@ -126,7 +126,7 @@ def default_hop(horizon: int) -> int:
 def choose_hop(hops: Sequence[int], measured: Latencies) -> HopChoice:
     """Return the largest of `hops` (at least one) that fits, else the smallest with which the listener keeps up.
 
-    Of the hops that do not fit, the smallest gives up least.
+    Of the hops that do not fit, the smallest gives up least. If the listener keeps up with none, return the largest.
     """
     fitting = [hop for hop in hops if measured.fits(hop)]
     otherwise = min((hop for hop in hops if measured.keeps_up(hop)), default=max(hops))

@@ -1,4 +1,4 @@
-"""Joints of a head: the servo and bus of each, its range and limits, its safety, and the drive that it follows.
+"""Joints of a head: the servo and bus of each joint, its range and limits, its safety, and the drive that it follows.
 
 A drive is an `Expression`: one channel, one shared expression, or a sum, maximum, minimum, mean or product of
 expressions. The value of a node then passes, in this order, its dead band, curve, gain, offset and clamp. Couplings and
@@ -24,9 +24,9 @@ from sfms_robot.plugins import plugins
 GROUPS: Final = ("sum", "max", "min", "mean", "product")
 KINDS: Final = ("channel", "use", *GROUPS)
 MOST_FACTORS: Final = 4
-SMALLEST_STEP: Final = 1e-6  # between two x of a curve
+SMALLEST_STEP: Final = 1e-6  # smallest distance between two x of a curve
 BUS_FAMILIES: Final = ("dynamixel2", "dynamixel1", "feetech", "maestro", "ssc32")
-BUS_GROUP: Final = "sfms_robot.buses"  # entry points: families of other packages (`servo.families`)
+BUS_GROUP: Final = "sfms_robot.buses"  # group of entry points with the families of other packages (`servo.families`)
 
 
 def _channel(name: str) -> str:
@@ -39,21 +39,21 @@ Channel = Annotated[str, AfterValidator(_channel)]
 ModelName = Annotated[str, AfterValidator(model_name)]
 MeasuredFault = Annotated[str, Field(pattern="^(input voltage|overheating)$")]
 Parts = Annotated[tuple["Expression", ...], Field(min_length=1)]
-Gain = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]  # bounded: no drive can overflow
+Gain = Annotated[float, Field(ge=-1000, le=1000, allow_inf_nan=False)]  # bounded, so that no drive can overflow
 Knob = Annotated[float, Field(ge=0, le=2, allow_inf_nan=False)]
-Lag = Annotated[float, Field(ge=0, le=500, allow_inf_nan=False)]  # ms; the horizon of a plan is 320
+Lag = Annotated[float, Field(ge=0, le=500, allow_inf_nan=False)]  # ms; the horizon of a plan is 320 ms
 
 
 class Expression(Model):
     """A node of a drive. A bare name stands for `{channel: NAME}`, or `{use: NAME}` for a shared expression.
 
     Attributes:
-        channel, use, sum, max, min, mean, product: exactly one of these; a product has at most four factors.
-        dead_band: values this near to 0 become 0, the others come nearer by as much.
-        curve: points (x, y), x rising; between them a monotone cubic (PCHIP), beyond them the last y.
-        gain: factor; `gain_up` and `gain_down` take its place above and below 0.
+        channel, use, sum, max, min, mean, product: exactly one of these is given; a product has at most four factors.
+        dead_band: values nearer to 0 than this become 0, and all others move nearer to 0 by this amount.
+        curve: points (x, y) with rising x; a monotone cubic (PCHIP) between the points, constant beyond the outermost.
+        gain: factor; `gain_up` and `gain_down` replace it for values above and below 0.
         offset: added after the gain.
-        clamp: (low, high) of the result.
+        clamp: (low, high), limits of the result.
     """
 
     channel: Channel | None = None
@@ -90,7 +90,7 @@ class Expression(Model):
 
     @property
     def parts(self) -> tuple[Expression, ...]:
-        """The nodes below; empty for a channel or a shared expression."""
+        """Nodes directly below this one; empty for a channel or a shared expression."""
         return self.sum or self.max or self.min or self.mean or self.product or ()
 
     @property
@@ -99,12 +99,12 @@ class Expression(Model):
 
     @property
     def gains(self) -> tuple[float, float]:
-        """Factor below 0 and above 0."""
+        """Factors below 0 and above 0."""
         down = self.gain if self.gain_down is None else self.gain_down
         return down, self.gain if self.gain_up is None else self.gain_up
 
     def nodes(self) -> Iterator[Expression]:
-        """Yield this node and all below it, without those of shared expressions."""
+        """Yield this node and all nodes below it, without those of shared expressions."""
         yield self
         for part in self.parts:
             yield from part.nodes()
@@ -115,13 +115,14 @@ class Expression(Model):
 
 
 class Coupling(Model):
-    """A bound that joints keep together whatever their drives ask: sum of weight x joint >= at_least, in joint units.
+    """A bound on several joints, whatever their drives request: sum of weight x joint >= `at_least`, in joint units.
 
-    Where the sum would be less, the joints under `moving` give way, the first as far as its range goes, then the next.
+    `keep` holds the weights. If the sum would be less, the joints under `moving` give way, the first as far as its
+    range allows, then the next.
     """
 
     keep: dict[Name, Gain] = Field(min_length=2)
-    at_least: float = Field(le=0, ge=-1000)  # at rest the sum is 0, and rest must be allowed
+    at_least: float = Field(le=0, ge=-1000)  # the sum is 0 at rest, which must be allowed
     moving: tuple[Name, ...] = Field(min_length=1)
 
     def contradictions(self) -> Problems:
@@ -133,7 +134,7 @@ class Coupling(Model):
 
 
 class Fold(Model):
-    """A channel without a joint, shown by the joint of another: `gain` x channel is added to that joint's drive."""
+    """A channel that has no joint, shown by the joint `into`: `gain` x channel is added to the drive of that joint."""
 
     channel: Channel
     into: Name
@@ -141,12 +142,12 @@ class Fold(Model):
 
 
 class Region(Model):
-    """Joints that are turned up and down together; both knobs run from 0 to 2 and start here.
+    """Joints with two common knobs, `intensity` and `style`, from 0 to 2; a run starts with the values given here.
 
     Attributes:
-        joints: no joint is in two regions.
-        intensity: how far from rest everything goes; 0 is rest.
-        style: how much of the fine detail shows; 0 lets only large motions through, 2 doubles the small ones.
+        joints: joints of the region; no joint may be in two regions.
+        intensity: factor on the distance from rest; 0 is rest.
+        style: amount of fine detail; 0 lets only large motions through, 2 doubles small motions.
     """
 
     joints: tuple[Name, ...] = Field(min_length=1)
@@ -155,7 +156,7 @@ class Region(Model):
 
 
 class LoadRule(Model):
-    """A present current above `current_mA` for `for_s` without a break, and the reaction of the joint."""
+    """A load rule: the reaction of a joint to a present current above `current_mA` for `for_s` without a break."""
 
     current_mA: Positive
     for_s: Positive
@@ -166,17 +167,19 @@ class Safety(Model):
     """Force limits of a joint, and its reaction when its servo reports a fault.
 
     Attributes:
-        current_limit_mA: the servo never pushes harder; needs a servo with a current sensor.
-        torque_limit_percent: of the servo's full torque (its voltage, to be exact); for those without such a sensor.
-        on_fault: hold where it is, limp (torque off), reduce (half the force), or reboot and ease in again.
-        pinch: something is in the way. By default 60 % of the servo's own current limit for half a second: limp.
-        strain: a pose that takes force for long heats the servo and makes it sing. Off by default.
-        stop: at the end of a run, once at rest: torque off, or kept.
-        halt: in an emergency stop, once the joint stands: torque off, or kept. By default joints of the neck, which
-            bear its weight, keep it.
-        warm_C, hot_C: temperature from which the joint moves half as far, and from which it stays at rest.
+        current_limit_mA: limit of the servo's current, and thereby of its force; needs a servo with a current sensor.
+        torque_limit_percent: limit in percent of the servo's full torque (its voltage, to be exact), for servos without
+            a current sensor.
+        on_fault: hold where the joint is, limp (torque off), reduce (half the force), or reboot and ease in again.
+        pinch: load rule for something in the way. Default: limp after half a second above 60 % of the servo's own
+            current limit.
+        strain: load rule for a pose that needs force for long, which heats the servo and makes it hum. Off by default.
+        stop: torque at the end of a run, once the joint is at rest: off (release) or kept (hold).
+        halt: torque in an emergency stop, once the joint stands: off (release) or kept (hold). By default joints of the
+            neck, which bear its weight, keep it.
+        warm_C, hot_C: temperatures from which the joint moves half as far, and from which it stays at rest.
         registers: raw values written before torque comes on: gains, profiles and the like (`check.is_harmless`).
-        stored: raw values that have to be stored in the servo; compared before torque comes on, never written.
+        stored: raw values that have to be stored in the servo; they are compared before torque comes on, never written.
     """
 
     current_limit_mA: Positive | None = None
@@ -196,19 +199,19 @@ class Safety(Model):
             yield f"hot_C: {self.hot_C:g} is not above warm_C ({self.warm_C:g})"
 
     def merged(self, other: Safety | None) -> Safety:
-        """Return this, overridden by the keys that `other` gives explicitly."""
+        """Return these settings, overridden by the keys that `other` sets explicitly."""
         return self if other is None else self.replaced(**{key: getattr(other, key) for key in other.model_fields_set})
 
 
 class Threshold(Model):
-    """A fault counts only when its measured value lies outside min..max (V for voltage, degC for heat)."""
+    """Range of the measured value of a fault (V for voltage, degC for heat); the fault counts only outside min..max."""
 
     min: Finite | None = None
     max: Finite | None = None
 
 
 class Faults(Model):
-    """The servo faults that cause a reaction, by the names in the firmware map."""
+    """The servo faults that cause a reaction: all except those under `mask`, by the names in the firmware map."""
 
     mask: tuple[str, ...] = ()
     thresholds: dict[MeasuredFault, Threshold] = {}
@@ -223,13 +226,13 @@ class LimitClass(Model):
 
 
 class Joint(Model):
-    """One joint: its place on a bus, how far and fast it may go, and its drive.
+    """One joint: its servo on a bus, its range and limits, and its drive.
 
     Ticks = zero_ticks + sign * ratio * angle / (angle per tick of the servo). `drive` is in units of the range
     (-1 = min, 0 = rest, +1 = max) when `unit` is "range", in radians when it is "rad".
 
-    With `mirror_of` the joint takes each value that it does not give itself from its twin on the other side, with the
-    drive (and for `mirror_sense: opposite` the range) turned round; `sign` then differs when the sense is the same.
+    With `mirror_of` the joint takes each value that it does not set itself from its twin on the other side, with left
+    and right of the drive exchanged. `mirror_sense: same` reverses the sign; `opposite` negates drive and range.
     """
 
     bus: Name
@@ -247,7 +250,7 @@ class Joint(Model):
     drive: Expression | None = None
     mirror_of: Name | None = None
     mirror_sense: Literal["same", "opposite"] = "same"
-    safety: Safety | None = None  # overrides that of the head
+    safety: Safety | None = None  # overrides the safety section of the head
     note: str = ""
 
     def contradictions(self) -> Problems:
@@ -272,7 +275,7 @@ class Joint(Model):
 
 
 class JointDefaults(Model):
-    """Values of every joint that gives none itself."""
+    """Values for all joints that do not set them."""
 
     bus: Name | None = None
     model: ModelName | None = None
@@ -305,13 +308,13 @@ class BusConfig(Model):
 
     Attributes:
         read_deadline_ms: a servo that does not answer for this long counts as silent.
-        fast_read: all servos answer in one packet; "auto" tries it at start.
-        watchdog_ms: of the servos' own watchdog; 0 leaves it off.
-        stagger_ms: between the torque of one servo and that of the next.
+        fast_read: all servos answer a read in one packet; "auto" tries this at the start.
+        watchdog_ms: time of the servos' own watchdog; 0 leaves it off.
+        stagger_ms: pause between switching on the torque of one servo and of the next.
         reconnect_s: a bus without any answer for this long has failed.
-        rs485: the direction of a half-duplex RS-485 driver is switched by the program through the RTS line (rts) or by
-            the driver (kernel); None for adapters that switch it themselves.
-        crc: a Maestro has "Enable CRC" on, and gets one with every command.
+        rs485: the direction of a half-duplex RS-485 driver chip is switched by the program through the RTS line (rts)
+            or by the serial driver (kernel); None for adapters that switch it themselves.
+        crc: true for a Maestro with "Enable CRC" on; every command then carries a CRC.
     """
 
     family: Annotated[str, AfterValidator(_family), WithJsonSchema({"enum": list(BUS_FAMILIES)})]

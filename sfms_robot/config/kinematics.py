@@ -1,4 +1,4 @@
-"""The neck of a head, which turns a pose into joints: one section of its file, `kind: serial` or `kind: stewart`."""
+"""Neck of a head, which converts a pose to joint angles: a section of its file, `kind: serial` or `kind: stewart`."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ Row = tuple[Finite, Finite, Finite, Finite]
 
 
 class Split(Model):
-    """One axis shared by two joints in series: by a fixed share, or low frequencies to the lower one.
+    """An axis shared by two joints in series, by a fixed share or by frequency.
 
-    `lower_share` is the lower joint's part, 0..1. With `crossover_hz` a one-pole low-pass of the angle goes to the
-    lower joint and the rest to the upper one. The part beyond the limits of one joint goes to the other.
+    `lower_share` is the lower joint's part, 0..1. With `crossover_hz` the angle after a one-pole low-pass goes to the
+    lower joint and the rest to the upper joint. The part beyond the limits of one joint goes to the other.
     """
 
     lower: Name
@@ -57,7 +57,7 @@ AxisJoints = Annotated[
 
 
 class SerialNeck(Model):
-    """A neck of axes one on top of the other, from the base to the head; an axis has the angle of its joint."""
+    """A neck of axes in series, with `order` from the base to the head; an axis has the angle of its joint."""
 
     kind: Literal["serial"]
     order: tuple[AxisName, ...] = Field(min_length=1, max_length=3)
@@ -77,13 +77,13 @@ class SerialNeck(Model):
         yield from _distinct(self.joints())
 
     def joints(self) -> Names:
-        """Return every joint that the neck moves, from the base up; a differential has its two at its first axis."""
+        """Return every joint that the neck moves, from the base up; both joints of a differential at its first axis."""
         geared = next((axis for axis in self.order if axis not in self.axes), None)
         turning = [self.joints_of(axis) for axis in self.order if axis in self.axes or axis == geared]
         return tuple(chain.from_iterable(turning))
 
     def joints_of(self, axis: str) -> Names:
-        """Return the joints that turn about one axis; none about one that the neck does not have."""
+        """Return the joints that turn about one axis; empty for an axis that the neck does not have."""
         pair = self.differential
         place = next((place for name, place in self.axes.items() if name == axis), None)
         if isinstance(place, str):
@@ -94,7 +94,7 @@ class SerialNeck(Model):
 
 
 class Leg(Model):
-    """One crank and rod. `servo_from_body` is 3 x 4: body coordinates [m] -> the servo's, z its axis."""
+    """One crank and rod. `servo_from_body` (3 x 4) maps body coordinates [m] to those of the servo, whose axis is z."""
 
     joint: Name
     side: Literal[1, -1]
@@ -103,7 +103,7 @@ class Leg(Model):
 
 
 class PoseLimits(Model):
-    """Largest lean of the head against the body, also where the legs could reach farther."""
+    """Largest angles between head and body, even where the legs could reach farther."""
 
     roll_deg: Positive = 180.0
     pitch_deg: float = Field(default=89.0, gt=0, lt=90)
@@ -111,7 +111,10 @@ class PoseLimits(Model):
 
 
 class BodyYaw(Model):
-    """A joint that turns the whole platform: it takes the yaw beyond `beyond_deg`, or the low-passed yaw."""
+    """A joint that turns the whole platform by the yaw beyond `beyond_deg`, which is the most that the legs turn.
+
+    With `low_pass_hz` it turns by the low-passed yaw instead, and farther where the legs would exceed `beyond_deg`.
+    """
 
     joint: Name
     beyond_deg: NonNegative = 40.0
@@ -119,7 +122,7 @@ class BodyYaw(Model):
 
 
 class StewartPlatform(Model):
-    """Six cranks and rods of equal size; the head's home is `home_height_m` above the body's origin."""
+    """A neck on six cranks and rods of equal size; the head's home is `home_height_m` above the body's origin."""
 
     kind: Literal["stewart"]
     crank_m: Positive
@@ -137,11 +140,11 @@ class StewartPlatform(Model):
                 yield f"legs.{number}.servo_from_body is not a rotation and a shift"
 
     def joints(self) -> Names:
-        """Return the joint of body yaw, if any, then those of the legs in order."""
+        """Return the joint of the body yaw, if there is one, and then those of the legs in order."""
         return self.joints_of("yaw")
 
     def joints_of(self, axis: str) -> Names:
-        """Return the joints that move the head about or along one axis: all legs, and for yaw the body's first."""
+        """Return the joints that move the head about or along one axis: all legs, and for yaw first the body's."""
         body = (self.body_yaw.joint,) if self.body_yaw and axis == "yaw" else ()
         return (*body, *(leg.joint for leg in self.legs))
 

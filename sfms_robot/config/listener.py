@@ -1,4 +1,4 @@
-"""Settings of a listener, from the config.yaml in its folder, and how often it makes each kind of event."""
+"""Settings of a listener, from the config.yaml in its folder, and its rate of each kind of event."""
 
 from __future__ import annotations
 
@@ -23,19 +23,20 @@ Placement = Literal["exact", "penalised", "static", "static_paper", "learned_pap
 GAZE_CHANNELS: Final = tuple(name for name in BLENDSHAPES if name.startswith("eyeLook"))
 # Conversational states of ARIG (3.3), in the order of the model's classes.
 STATES: Final = ("speaking", "listening", "receiving_feedback", "thinking", "interrupted", "waiting", "giving_feedback")
-# States of a listener with events: visible feedback, by its kind, is separate from audible feedback.
+# States of a listener with events: kinds of visible feedback are separate from audible feedback.
 EVENT_STATES: Final = (*STATES, "giving_feedback_nod", "giving_feedback_smile")
 
 
 class Calmness(Model):
-    """Events a minute by kind: more is livelier, 0 is never, None is as people do.
+    """Events per minute by kind: more is livelier, 0 is never, None is the rate of people.
 
-    A rate holds for the mean over a meeting, with looks at the head some of the time. A head that is addressed and
-    looked at nods more often, one that is not nods less often.
+    A rate is the mean over a meeting in which people look at the head some of the time. A head that is addressed and
+    looked at nods more often, a head that is not nods less often. Without listening only blinks, gaze shifts and
+    answers to a smile begin.
 
     Attributes:
-        nod, shake, tilt: of the head. Its own nods included, a head in a meeting nods at this rate, within a tenth.
-            Nods, shakes, smiles, laughs, brows and "mm-hm" only come while listening.
+        nod, shake, tilt: movements of the head. A head in a meeting nods at this rate, within a tenth, also when the
+            effect of earlier nods is included.
         gaze_shift: looks away from the person; each is followed by a look back.
         addressed: sense: the person's attention decides whether the head is addressed, and without any face it is;
             assume: it always is; never: it never is.
@@ -53,18 +54,18 @@ class Calmness(Model):
     addressed: Literal["sense", "assume", "never"] = "sense"
 
     def per_minute(self, kind: str) -> float | None:
-        """Return the rate of one of `frames.EVENT_KINDS`; None: as people do."""
+        """Return the rate of one of `frames.EVENT_KINDS`; None: the rate of people."""
         rate: float | None = getattr(self, kind)
         return rate
 
 
 class ChannelGroup(Model):
-    """Channels that share one keyframe track: at most one code per frame, from `levels[0] * levels[1] * ...`.
+    """Channels that share one keyframe track: at most one code per frame, out of `levels[0] * levels[1] * ...` codes.
 
     Attributes:
-        keyframes: of a window. keyframe_cost: in its place where placement is penalised, what a keyframe has to save in
-            squared error, summed over the group's channels in deviations.
-        transition_bias: on the logit of class 0, more for fewer keyframes.
+        keyframes: number per window. keyframe_cost: replaces `keyframes` for placement `penalised`: squared error that
+            a keyframe has to save, summed over the group's channels, in standard deviations.
+        transition_bias: added to the logit of class 0 (no keyframe); a larger value leads to fewer keyframes.
     """
 
     channels: Names = Field(min_length=1)
@@ -79,11 +80,12 @@ class ChannelGroup(Model):
 
 
 class SmileCourse(Model):
-    """The course of a decided smile (`listeners.sfms.courses`), in shares of its size, from training dyads.
+    """Course of a smile that has been decided (`listeners.sfms.draw`), in shares of its size, from training dyads.
 
     Attributes:
-        rise: at `RISE_S` after its beginning. fall: `FALL_S` before its end.
-        spread: deviation of the corners of a mouth (0 to 1) from the course that is left to the predictor.
+        rise: at 0, 0.12, 0.24, 0.36, 0.48, 0.6, 0.72 and 0.96 s after the beginning (`RISE_S`). fall: at 0, 0.12, 0.24,
+            0.36, 0.48, 0.6 and 0.96 s before the end (`FALL_S`).
+        spread: deviation from the course that is left to the predictor, for corners of the mouth from 0 to 1.
     """
 
     RISE_S: ClassVar[tuple[float, ...]] = (0.0, 0.12, 0.24, 0.36, 0.48, 0.6, 0.72, 0.96)
@@ -100,11 +102,11 @@ class SmileCourse(Model):
 
 
 class NodCourse(Model):
-    """The course of a nod that has been decided (`listeners.sfms.courses`), in shares of its size.
+    """Course of a nod that has been decided (`listeners.sfms.draw`), in shares of its size.
 
     Attributes:
-        fall: size of each swing relative to the one before it, from training dyads.
-        spread: deviation, where swings turn, that is left to the predictor.
+        fall: size of each swing relative to the swing before it, from training dyads.
+        spread: deviation from the course that is left to the predictor where swings turn.
     """
 
     spread: Positive
@@ -112,15 +114,15 @@ class NodCourse(Model):
 
 
 class Sampling(Model):
-    """Settings of drawing and showing tokens.
+    """Settings for drawing tokens and showing them as motion.
 
     Attributes:
-        seam_frames: over these a plan fades into the motion before it.
-        smoothing: how far the head moves from each frame toward the mean of the two beside it, 0 to 1: motion between
-            coarse codes has corners, which make servos audible. 0 is the paper.
-        reach: a code follows another only as fast as faces moved in training (`listeners.sfms.reachable`). Not in
-            the paper.
-        nod, smile: their courses, of a listener with `events`; None: those of the predictor.
+        seam_frames: number of frames over which a new plan blends in with the motion before it.
+        smoothing: share, 0 to 1, by which each frame of the head moves toward the mean of its two neighbours: motion
+            between coarse codes has corners, which make servos audible. 0, no smoothing, is the paper's.
+        reach: a code may follow another only as fast as faces moved in training (`listeners.sfms.draw.CodeReach`). Not
+            in the paper.
+        nod, smile: courses of nods and smiles of a listener with `events`; None: the predictor's own.
     """
 
     temperature: Positive = 1.0
@@ -133,14 +135,14 @@ class Sampling(Model):
 
 
 def uneven_heads(heads: int, **widths: int) -> Problems:
-    """Yield the problem of each width, named by its key, that cannot be divided into `heads` heads of even width."""
+    """Yield the problem of each width, by its key, that cannot be divided into `heads` heads of even width."""
     for key, width in widths.items():
         if width % (2 * heads):
             yield f"{key} {width} is not a multiple of twice heads ({heads})"
 
 
 class Scores(Model):
-    """The network that ranks keyframes, of the learned placements. `sweeps`: rounds of corrections of `learned`."""
+    """The network that scores keyframes for learned placements. `sweeps`: rounds of corrections for `learned`."""
 
     width: Count = 32
     layers: Count = 2
@@ -155,13 +157,14 @@ class ListenerSettings(Model):
     """Settings of every kind of listener: `configs/listeners/NAME/config.yaml`.
 
     Attributes:
-        motion_space: channels of the model (`frames.SPACE_CHANNELS`); plans are `FaceFrame`s in any space.
-        neutral: face at rest in that space, one number per channel; None: the space's own.
-        metres_per_unit: scale of the space's translation; None: it has none and is left out.
-        flame_matrix: file with FLAME -> ARKit, beside config.yaml or absolute; deca56 moves pose and jaw only without.
-        events: the model is given nods, smiles and blinks decided elsewhere (`signals.control`). It then draws
-            everything but gaze: neither the direction of the eyes nor the head's part of it, which are kinematics.
-        sway: slow motion of the head is a separate process (`listeners.idle`), not drawn by the model. Needs events.
+        motion_space: channels of the model (`frames.SPACE_CHANNELS`); plans are `FaceFrame`s for every space.
+        neutral: face at rest in that space, one number per channel; None: that of the space.
+        metres_per_unit: scale of the space's translation; None: it has no scale and is left out.
+        flame_matrix: file with a matrix FLAME -> ARKit, relative to config.yaml or absolute; without it `deca56` moves
+            only pose and jaw.
+        events: nods, smiles and blinks are inputs of the model, decided elsewhere (`signals.control`). The model draws
+            everything except gaze: the direction of the eyes and the head's part of it come from kinematics.
+        sway: slow motion of the head is a separate process (`listeners.idle`), not drawn by the model. Needs `events`.
     """
 
     kind: str
@@ -192,25 +195,27 @@ class ListenerSettings(Model):
 
 
 class Sfms(ListenerSettings):
-    """Sparse keyframe tokens and their predictor.
+    """Settings of an SFMS listener: sparse keyframe tokens and their predictor.
 
-    `groups` are written out, or named as a whole: `{preset: one|four|all, levels: [...], keyframes: k}`.
+    `groups` lists every group by name, or names a preset: `{preset: one|four|all, levels: [...], keyframes: k}`.
 
     Attributes:
-        hop: frames between plans; auto: chosen at the start of a run from measurements (`hop.choose_hop`), and
-            `default_hop` without them.
+        hop: frames between plans; auto: chosen at the start of a run from measurements (`hop.choose_hop`), or
+            `hop.default_hop` without measurements.
         audio: features of the voice: mel (4 rows of 128 per frame, aligned by convolution and max-pool), mfcc78 or
             wav2vec2 (768), one row per frame.
-        wav2vec2: folder of a model in the layout of transformers, beside config.yaml or absolute; only streams need it.
-        phase: the speaker's place in a phrase is an input. Beyond the paper; it reaches back further than 40 frames.
-        sequential: each frame knows the keyframes drawn before it. Beyond the paper, which draws 8 in parallel.
-        placement: where keyframes go (`listeners.sfms.placement`); max_gap_frames bounds `exact` and `penalised`.
-        ramp_frames: motion toward a keyframe begins so many frames before it at most; the one before is held till then;
-            None: a straight line all the way, the paper's, which a stream cannot know beyond its plan.
-        quantizer: a fixed grid (fsq) or learned vectors of `code_dims` dimensions (vq); either has a group's number of
-            codes, the product of its levels. squashed: learned vectors lie in -1..1, as the grid's codes do.
-        inpainter: added to straight lines (residual), or in place of them (paper).
-        tokenizer_layers: transformer blocks in each of the inpainter's three parts.
+        wav2vec2: folder of a model in the layout of transformers, relative to config.yaml or absolute; only streams
+            need it.
+        phase: the speaker's place in a phrase is an input. Not in the paper; it reaches back further than 40 frames.
+        sequential: each frame depends on the keyframes drawn before it. Not in the paper, which draws 8 in parallel.
+        placement: method that places keyframes (`listeners.sfms.placement`); max_gap_frames: largest gap between them,
+            for `exact` and `penalised`.
+        ramp_frames: motion toward a keyframe begins at most this many frames before it; until then the previous one is
+            held. None: a straight line all the way, as in the paper, which a stream cannot know beyond its plan.
+        quantizer: a fixed grid (fsq) or learned vectors of `code_dims` dimensions (vq). Both have the product of a
+            group's levels as its number of codes. squashed: learned vectors are in -1..1, like the grid's codes.
+        inpainter: its output is added to straight lines (residual) or replaces them (paper).
+        tokenizer_layers: number of transformer blocks in each of the inpainter's three parts.
     """
 
     kind: Literal["sfms"]
@@ -241,7 +246,7 @@ class Sfms(ListenerSettings):
     @model_validator(mode="before")
     @classmethod
     def _presets(cls, raw: Any) -> Any:
-        """Write a preset of groups out: one, four (neck, brows, eyes, mouth and jaw), or all channels alone."""
+        """Replace a preset by its groups: one, four (neck, brows, eyes, mouth and jaw), or a group for each channel."""
         if not (isinstance(raw, dict) and isinstance(raw.get("groups"), dict) and "preset" in raw["groups"]):
             return raw
         wanted, space = raw["groups"], raw.get("motion_space", "arkit58")
@@ -327,22 +332,23 @@ def _both(value: Any) -> Any:
     return (value, value) if isinstance(value, int | float) else value
 
 
-Temperature = Annotated[tuple[NonNegative, NonNegative], BeforeValidator(_both)]  # first and last; one number: both
+Temperature = Annotated[tuple[NonNegative, NonNegative], BeforeValidator(_both)]  # first and last; one number is both
 
 
 class Diffusion(Model):
-    """The DiffusionMLP and how it is sampled.
+    """Settings of the DiffusionMLP and of its sampling.
 
     Attributes:
-        width: of its condition and blocks; the paper takes that of its motion, 262.
-        train_steps: noise levels in training. schedule: `cosine`; `logarithmic` has as many of them for each factor of
-            noise over motion, so that small motion is taught too.
-        steps: of them used to sample one frame, spread evenly.
-        sampler: `ddpm` is the paper's (4); `ddim` adds no noise between steps, which suits few of them.
-        temperature: factor on the noise that is added between steps; two: after the first step and before the last,
-            evenly in between. Early noise decides what happens, late noise is jitter.
-        temperatures: the same, in its place, for channels whose names begin so: `{eye: 1.1}`; the first that fits.
-        clamp: every estimate of the clean motion is kept within the range of the data; (4) does not.
+        width: width of its condition and blocks; the paper uses the width of its motion, 262.
+        train_steps: number of noise levels in training. schedule: `cosine`, or `logarithmic`, with equally many levels
+            for each factor of noise over motion, so that small motion is learned too.
+        steps: number of these levels that are used to sample one frame, spread evenly.
+        sampler: `ddpm` is equation (4) of the paper; `ddim` adds no noise between steps, which suits few steps.
+        temperature: factor on the noise that is added between steps. Two numbers: after the first step and before the
+            last, changing evenly in between. Early noise decides what happens, late noise is jitter.
+        temperatures: replaces `temperature` for channels whose names begin with a key: `{eye: 1.1}`; the first match
+            counts.
+        clamp: every estimate of the clean motion is kept within the range of the data; equation (4) does not do this.
     """
 
     width: int = Field(default=262, ge=2, multiple_of=2)
@@ -365,24 +371,25 @@ class Diffusion(Model):
 
 
 class Arig(ListenerSettings):
-    """Frame-wise autoregression with a diffusion head.
+    """Settings of an ARIG listener: frame-wise autoregression with a diffusion head.
 
     Attributes:
-        sound: `mel` (4 rows of 128 per frame) or `wav2vec2` (768 per frame, brought with the data: trains, never runs).
-        phase: each track's place in a phrase (`signals.phase`) is an input beside its sound. Beyond the paper; it
-            reaches back further than a short context.
-        width, feedforward: of every block; heads: of every attention.
-        chunk_frames: c of the paper; context_chunks: w (4: ablation "w/o long-range context").
+        sound: `mel` (4 rows of 128 per frame) or `wav2vec2` (768 per frame, from the data: for training, not for runs).
+        phase: each track's place in a phrase (`signals.phase`) is an input in addition to its sound. Not in the paper;
+            it reaches back further than a short context.
+        width, feedforward: width and hidden width of every block; heads: number of heads of every attention.
+        chunk_frames: c in the paper; context_chunks: w in the paper (4: ablation "w/o long-range context").
         bidirectional_layers: 2 in the paper; integrated_layers, context_layers: the paper leaves them open.
-        sound_frames: of the agent, that the coarse motion looks at; motion_frames: that the temporal layer looks at.
+        sound_frames: number of the agent's last sound frames that the coarse motion attends to; motion_frames: number
+            of its last motion frames that the temporal layer attends to.
         state_guidance: false leaves the conversational states out; visual: false leaves motion out of the behaviours;
             interaction: `linear` puts plain layers in place of bidirectional-integrated learning;
-            discrete: codes of `code_levels` and a softmax in place of diffusion (tables 1 and 4), codes of `motion`
-            itself: what codes of steps get wrong would add up.
+            discrete: codes of `code_levels` and a softmax in place of diffusion (tables 1 and 4). The codes are of
+            `motion` itself, because errors of codes of steps would add up.
         draws: target of the sampler: the `motion` of a frame, as in the paper; the `step` from the frame before, whose
             errors are small where a face is still, but add up; or the `innovation` of a first-order autoregression
-            fitted on the data, a step that is forgotten as fast as people's motion returns to its mean.
-        precision: of large layers on onnxruntime; auto: int8 where the folder has such graphs. torch computes in fp32.
+            fitted on the data, a step that decays as fast as people's motion returns to its mean.
+        precision: of large layers on onnxruntime; auto: int8 if the folder has such graphs. torch computes in fp32.
     """
 
     kind: Literal["arig"]
@@ -424,8 +431,7 @@ class Arig(ListenerSettings):
         return EVENT_STATES if self.events else STATES
 
 
-# The model of config.yaml for each kind of listener that a folder may contain; for listeners of other packages see
-# `plugins`.
+# The model of config.yaml for each kind of listener in a folder; for listeners of other packages see `plugins`.
 LISTENER_KINDS: Final[Mapping[str, type[ListenerSettings]]] = {"sfms": Sfms, "arig": Arig}
 
 

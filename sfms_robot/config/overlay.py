@@ -6,8 +6,8 @@ kept apart from the shipped file, in layers that are applied in this order:
     head file -> calibrate (zero, ends and direction of each joint) -> stored (registers of a servo, as confirmed)
               -> fit (drives learnt from sight)
 
-A measurement holds for the servo and the head file that it was made with. If one of them has changed since, the joint
-counts as not calibrated.
+A measurement is valid for the servo and the head file that it was made with. If one of them has changed since, the
+joint counts as not calibrated.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class Identity(Model):
-    """Identity of a servo. None where the family does not report it; `drive_mode` holds the direction bit alone."""
+    """Identity of a servo. Values that its family does not report are None; `drive_mode` is only the direction bit."""
 
     id: int = Field(ge=0, le=253)
     model: str
@@ -51,11 +51,11 @@ class Identity(Model):
 
     @property
     def stored(self) -> dict[str, int]:
-        """Registers that a measurement of zero and direction declares to be stored in the servo."""
+        """Values of the servo's stored registers on which a measurement of zero and direction depends."""
         return self.model_dump(include={"homing_offset", "drive_mode"}, exclude_none=True)
 
     def difference(self, now: Identity) -> str | None:
-        """Return the first difference to `now` in words, or None."""
+        """Return a text about the first difference from `now`, or None."""
         for key in Identity.model_fields:
             was, is_ = getattr(self, key), getattr(now, key)
             if was != is_:
@@ -122,11 +122,11 @@ class Overlay(Model):
 
     @property
     def measured(self) -> dict[str, Measured]:
-        """Measurements of joints, whether they hold or not."""
+        """Measurements of joints, valid or not."""
         return {} if self.calibrate is None else self.calibrate.joints
 
     def confirmed(self, sha256: str) -> dict[str, dict[str, int]]:
-        """Return the registers recorded as stored in servos, by joint, for a head file of this hash."""
+        """Return the registers that are recorded as stored in servos, by joint, for a head file with this hash."""
         return self.stored.joints if self.stored is not None and self.stored.head_sha256 == sha256 else {}
 
     def recorded(self, sha256: str, joint: str, stored: Mapping[str, int]) -> Overlay:
@@ -141,8 +141,8 @@ class Layered:
     """A head with its overlay applied.
 
     Attributes:
-        calibrated: joints whose measurement holds.
-        refused: joint -> reason why its measurement does not hold.
+        calibrated: joints with a valid measurement.
+        refused: joint -> reason why its measurement is not valid.
         fitted: joints with a learnt drive.
         notes: one line for each layer that is not used at all.
     """
@@ -165,7 +165,7 @@ def head_hash(name: str) -> str:
 
 
 def load_overlay(head: Head, file: Path | None = None) -> Overlay:
-    """Return a head's overlay, empty without a file. Raises ConfigError for that of another head, or unknown joints."""
+    """Return a head's overlay, empty without a file. Raises ConfigError if its head differs or a joint is unknown."""
     file = file or overlay_file(head.name)
     if not file.is_file():
         return Overlay(head=head.name)
@@ -188,7 +188,7 @@ def check_writable(file: Path) -> Path:
 
 
 def save_overlay(overlay: Overlay, file: Path) -> None:
-    """Write an overlay whole or not at all. Raises ConfigError."""
+    """Write an overlay completely or not at all. Raises ConfigError."""
     plain = overlay.model_dump(mode="json", exclude_none=True, exclude_defaults=True)
     text = "# Of one built head: written by `sfms-robot head calibrate`, `head fit` and `doctor --fix`.\n"
     write_whole(file, text + yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=120))
@@ -199,7 +199,7 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
 
     Args:
         sha256: hash of the head's present file.
-        servos: the servo that answers at each joint, or None; without `servos` only the file is compared.
+        servos: identity of the servo that answers at each joint, or None; without `servos` only the file is compared.
 
     Raises ConfigError for a layer that contradicts other parts of the head.
     """
@@ -240,7 +240,7 @@ def layered(head: Head, overlay: Overlay, sha256: str, servos: Mapping[str, Iden
 def calibrated(joint: Joint, found: Measured, usual: Safety) -> Joint:
     """Return the joint with measured zero, direction and ends; its rest angle is kept and lies at the measured centre.
 
-    `usual`: safety of the head, which that of the joint overrides.
+    `usual`: safety section of the head, which that of the joint overrides.
     """
     ticks_per_deg = found.sign * joint.ratio * load_firmware_map(joint.model).ticks_per_revolution / 360.0
     zero_ticks = round(found.center_ticks - ticks_per_deg * joint.rest_deg)
@@ -262,7 +262,7 @@ def record_stored(name: str, joint: str, stored: Mapping[str, int], practice: bo
     The head.yaml of the user is edited. The overlay is written instead for a shipped head, for a head that has an
     overlay (an edit would invalidate its measurements), for a file that cannot be written, and for a file whose form
     (an alias, a twin) does not allow a change of one joint alone.
-    `practice`: found on emulated servos. Raises ConfigError for a file that cannot be written.
+    `practice`: the servos are emulated. Raises ConfigError if the overlay cannot be written.
     """
     head = load_head(name)
     own, file = head_file(name), overlay_file(head.name, practice)
@@ -288,7 +288,7 @@ MEASURED: Final = ("zero_ticks", "sign", "min_deg", "max_deg")  # set by a calib
 
 
 def provenance(name: str) -> tuple[dict[str, dict[str, tuple[Any, str]]], list[str]]:
-    """Return the value and its origin per joint and key; and a line for each measurement and fit that does not hold.
+    """Return the value and its origin per joint and key; and a line for each measurement and fit that is not valid.
 
     Measurements count here regardless of the servos that are plugged in. Raises ConfigError for an invalid head.
     """

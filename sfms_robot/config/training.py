@@ -1,4 +1,4 @@
-"""Settings of training: those of every phase, of the two phases of SFMS, of ARIG, and of the tokenizers in tables."""
+"""Settings of training: of every phase, of both phases of SFMS, of ARIG, and of the tokenizers in tables."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _RESUMABLE = frozenset({"checkpoint_every", "checkpoint_minutes", "patience"})
 
 
 class Phase(Model):
-    """One run of the training loop, whatever is trained.
+    """Settings of one run of the training loop, for any model.
 
     Attributes:
-        steps, batch: length of the run, and samples a step.
-        learning_rate: where the warm-up ends and the cosine begins.
-        warm_up_steps: at most a tenth of `steps`.
-        clip_norm: largest gradient norm of each optimizer's parameters.
-        precision: bf16 is autocast; a CPU without instructions for it always computes in fp32.
-        evaluate_every: steps between evaluations of the held-out loss; 0: never, the last weights are kept.
+        steps, batch: number of steps of the run, and number of samples per step.
+        learning_rate: highest learning rate, reached at the end of the warm-up, where the cosine begins.
+        warm_up_steps: steps of warm-up, limited to a tenth of `steps`.
+        clip_norm: limit of the gradient norm, for the parameters of each optimizer.
+        precision: bf16 uses autocast; a CPU without instructions for it always computes in fp32.
+        evaluate_every: steps between evaluations of the held-out loss; 0: never, and the last weights are kept.
         patience: evaluations without a better held-out loss before training stops; None: train to the last step.
-        checkpoint_every, checkpoint_minutes: whichever comes first.
+        checkpoint_every, checkpoint_minutes: steps and minutes between checkpoints, whichever comes first.
     """
 
     steps: Count
@@ -53,15 +53,17 @@ class Phase(Model):
 
 
 class TokenizerTraining(Phase):
-    """Phase 1: scores, quantizer, inpainter.
+    """Settings of phase 1, which trains keyframe scores, quantizer and inpainter.
 
     Attributes:
-        score_tracks: tracks (a window of one group) that the scores of `learned` learn from in a step.
-        mask_loss: alpha of equation (13); temperature: first and last of Algorithm 1. Both of `learned_paper`.
-        tempered_draws: the temperature acts on what is drawn, as equation (6) reads; Algorithm 1 leaves the draw alone.
-        sparsity: weight of equation (8), of `adaptive`.
-        commitment: weight of ||sg[z_q] - E(z)|| in equation (13), of quantizer vq.
-        velocity_loss: weight of the error from one frame to the next.
+        score_tracks: tracks (one window of one group each) per step that the scores of placement `learned` learn from.
+        mask_loss: alpha of equation (13); temperature: first and last temperature of Algorithm 1. Both are for the
+            placements `learned_paper` and `adaptive`.
+        tempered_draws: true: the temperature also acts on which frames are drawn, as equation (6) reads; in Algorithm 1
+            it does not.
+        sparsity: weight of equation (8), for placement `adaptive`.
+        commitment: weight of ||sg[z_q] - E(z)||^2 in equation (13), for quantizer `vq`.
+        velocity_loss: weight of the error of the change from one frame to the next.
     """
 
     score_learning_rate: Positive = 3e-3
@@ -75,23 +77,25 @@ class TokenizerTraining(Phase):
 
 
 class PredictorTraining(Phase):
-    """Phase 2: the next-token predictor.
+    """Settings of phase 2, which trains the next-token predictor.
 
     Attributes:
-        tokens: keyframes are placed in whole dyads or long stretches (dyads), or in each training window separately
-            (windows), as in the paper, whose tokenizer has the predictor's window.
-        transition_weight: of class 0 in (14); a keyframe weighs 1. undo_weight: it is taken out of the probabilities
-            again afterwards, which the paper leaves open.
-        dtw_weight, dtw_gamma: of the soft-DTW on the keyframe indicator (IV-D3), and how soft its minima are.
-        neutral_prefix: share of windows that begin as a stream does; drop_audio, drop_face: that lack a modality.
-        history_noise: share of past keyframes that are one level off.
-        missed_keyframes: share of windows and groups whose last keyframes are missing, as in a roll-out, and have to be
-            made up for (`learning.sfms.missed_keyframes`); of placement `penalised`.
-        group_weights: of each group's loss; 1 where it is not named.
-        event_windows: share of windows in whose future an event other than a blink is under way, for listeners with
-            events; the events are given, so it changes no odds.
-        calibration_rounds: roll-outs that bring keyframe rates to those of the data; if any, one more measures the size
-            of nods that a listener with events produces for a given size.
+        tokens: dyads: keyframes are placed once per dyad, in the whole dyad, long stretches or consecutive windows;
+            windows: in each training window separately, as in the paper, whose tokenizer has the predictor's window.
+        transition_weight: weight of class 0 in equation (14); a keyframe has weight 1. undo_weight: remove this weight
+            from the probabilities after training; the paper leaves this open.
+        dtw_weight, dtw_gamma: weight of the soft-DTW on the keyframe indicator (IV-D3), and softness of its minima.
+        neutral_prefix: share of windows that begin like a stream; drop_audio, drop_face: share of windows without the
+            speaker's sound, without the speaker's face.
+        history_noise: share of past keyframes that are one level off (for quantizer `vq`: left out).
+        missed_keyframes: share of windows and groups whose last keyframes are left out, as in a roll-out. If the face
+            is then wrong by more than `keyframe_cost`, the target is a keyframe at once
+            (`learning.sfms.features.without_last_keyframes`). For placement `penalised`.
+        group_weights: weight of each group's loss, by name; 1 for a group that is not named.
+        event_windows: share of windows drawn from those in whose future an event other than a blink is in progress, for
+            listeners with events. The events are inputs, so this does not change their probabilities.
+        calibration_rounds: roll-outs that adjust the keyframe rates to those of the data. With any, `sampling.nod` and
+            `sampling.smile` of a listener with events also get the median courses of the training dyads.
     """
 
     tokens: Literal["dyads", "windows"] = "dyads"
@@ -126,12 +130,12 @@ class Training(Model):
 
 
 class Stage(Model):
-    """A part of the curriculum.
+    """A part of the curriculum of an ARIG training.
 
     Attributes:
-        share: of all steps.
-        speaking, listening, interaction: weights of the sets of these names when windows are drawn. A set that the data
-            lack is left out.
+        share: share of all steps that this part takes.
+        speaking, listening, interaction: weights of the sets of these names when windows are drawn. A set that is
+            missing in the data is left out.
     """
 
     share: float = Field(gt=0, le=1)
@@ -145,7 +149,7 @@ class Stage(Model):
 
 
 class GroupWeights(Model):
-    """Weights of the mean loss of each group of channels (`learning.arig.losses.GROUPS`), whatever their number."""
+    """Weight of each group of channels in the loss, regardless of its size (`learning.arig.trainer.GROUPS`)."""
 
     head: NonNegative = 1.0
     lids: NonNegative = 1.0
@@ -158,28 +162,30 @@ class GroupWeights(Model):
 
 
 class ArigPhase(Phase):
-    """The training of an ARIG listener.
+    """Settings for the training of an ARIG listener.
 
     Attributes:
-        window_frames: frames of one sample; its first one begins a stream, so context reaches no further back.
-        draws: noise levels per frame in equation (3): the sampler is small beside what its condition costs.
-        state_weight: of the states' cross-entropy (3.3); coarse_weight: of the coarse motion's squared error (3.4);
-            equation (3) weighs 1. The paper gives no weights.
-        history_noise: most that the past motion is off by, in standard deviations: in a stream it is the model's own.
-        speaking_noise: the same of jaw and mouth while the agent speaks: its words decide them, not their past.
-        own_states: previous states are the model's own answers, as a stream feeds them; else true ones.
-        state_noise: share of previous states that are drawn at random. A stream that continues from its own best guess
-            needs it: true ones would be copied. One that draws its states (events) is trained with true ones.
-        group_weights: of groups of channels in equation (3); None: every channel counts the same, which is the paper.
-        event_windows: share of windows in which an event other than a blink is under way, every kind as often as any
-            other, for listeners with events: smiles are rare.
-        drop_audio, drop_face: share of windows without the user's sound, without the face; drop_agent: share of the
-            windows in which the agent is silent that have no agent's track.
-        quiet_room: share of windows in which the noise of the user's microphone is weaker, down to that of a gate that
-            is shut; silent_user: share without any sound of it. No recording is that silent.
-        gain_db: most that either track is louder or softer; colour_db: most that its bands are, smoothly from low to
-            high, as another microphone has it; grain_db: deviation of every band of every row.
-        stages: the curriculum, in order; shares add up to 1.
+        window_frames: frames of one sample. The first frame begins a stream, so context reaches no further back.
+        draws: number of noise levels per frame in equation (3); the sampler costs little compared to its condition.
+        state_weight: weight of the cross-entropy of the states (3.3); coarse_weight: weight of the squared error of the
+            coarse motion (3.4). Equation (3) has weight 1. The paper states no weights.
+        history_noise: largest noise on the past motion, in standard deviations, as a stream's past is the model's own.
+        speaking_noise: the same for jaw, mouth and tongue while the agent speaks: words decide them, not their past.
+        own_states: true: previous states are the model's own answers, as in a stream; false: the true states.
+        state_noise: share of previous states that are drawn at random. A stream that continues from its most probable
+            state needs this, because it would copy true states. A stream that draws its states (`events`) is trained
+            with true states.
+        group_weights: weights of groups of channels in the losses of the motion; None: every channel counts the same,
+            as in the paper.
+        event_windows: share of windows drawn from those with an event other than a blink, every kind equally often, for
+            listeners with events, because smiles are rare.
+        drop_audio, drop_face: share of windows without the user's sound, without the user's face; drop_agent: share of
+            the windows with a silent agent in which the agent's track is missing.
+        quiet_room: share of windows in which the noise of the user's microphone is weaker, down to that of a closed
+            noise gate; silent_user: share of windows without any sound of the user. No recording is that silent.
+        gain_db: largest change of the level of either track; colour_db: largest deviation of its bands, smooth from low
+            to high, as with another microphone; grain_db: largest deviation of each single band of each row.
+        stages: the curriculum, in order; the shares add up to 1.
     """
 
     window_frames: int = Field(default=96, ge=2)
@@ -216,7 +222,7 @@ class ArigPhase(Phase):
             yield f"shares of the stages add up to {total:g}, not 1"
 
     def stage(self, step: int) -> Stage:
-        """Return the stage of a step; the last one from the end of its shares on."""
+        """Return the stage of a step; the last stage for a step beyond the end of all shares."""
         done = 0.0
         for stage in self.stages:
             done += stage.share
@@ -250,12 +256,12 @@ def parse_training(raw: Any, file: Path | str) -> Training | ArigTraining:
 
 
 class Baseline(Model):
-    """The common part of the dense and the grouped tokenizer: transformer encoder, codes, transformer decoder.
+    """Common settings of the dense and the grouped tokenizer: transformer encoder, codes, transformer decoder.
 
     Attributes:
-        quantizer: a fixed grid (fsq), or as many learned vectors of `code_dims` dimensions (vq).
-        levels: multiply to the codes of a codebook.
-        layers: transformer blocks of the encoder, and as many of the decoder.
+        quantizer: a fixed grid (fsq), or the same number of learned vectors of `code_dims` dimensions (vq).
+        levels: their product is the number of codes of a codebook.
+        layers: number of transformer blocks of the encoder, and also of the decoder.
     """
 
     window_frames: Count = 48
@@ -292,7 +298,7 @@ class Grouped(Baseline):
 
 
 class Recipe(Model):
-    """One tokenizer of the comparison tables and how it is trained; its keyframes are for an sfms tokenizer alone."""
+    """A tokenizer of the comparison tables: its model and its training. Only an sfms tokenizer has keyframes."""
 
     seed: Seed = 1
     model: Sfms | Dense | Grouped = Field(discriminator="kind")

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final, Literal, NamedTuple
 
-BITS: Final = 10  # bits of a byte on the wire: start, eight, stop
+BITS: Final = 10  # bits per byte on the wire: start bit, eight data bits, stop bit
 Way = Literal["together", "fast", "one by one"]
 
 
@@ -18,12 +18,12 @@ class Framing(NamedTuple):
     """Bytes of a family's packets in addition to the data.
 
     Attributes:
-        goal: data of one goal position, unless a model differs.
-        write, write_each: a write to several servos; per servo in it.
+        goal: data of one goal position, unless a model has another size.
+        write, write_each: a write to several servos; more for each servo in it.
         read: a read request to one servo.
         answer: the answer of one servo.
-        group, group_each: a read request to several servos; per servo in it.
-        fast, fast_each: the one packet in which all servos answer a fast read; per servo in it.
+        group, group_each: a read request to several servos; more for each servo in it.
+        fast, fast_each: the one packet in which all servos answer a fast read; more for each servo in it.
         longest: the longest packet: for both Dynamixel protocols the longest that the vendor's SDK builds; a Feetech
             packet has a length of one byte. 0: no limit.
     """
@@ -57,6 +57,6 @@ FRAMINGS: Final[Mapping[str, Framing]] = {  # by bus family
     "dynamixel2": Framing(4, 14, 1, read=14, answer=11, group=14, group_each=1, fast=8, fast_each=4, longest=1024),
     "dynamixel1": Framing(2, 8, 1, read=8, answer=6, group=7, group_each=3, longest=250),
     "feetech": Framing(2, 8, 1, read=8, answer=6, group=8, group_each=1, longest=259),
-    "maestro": Framing(2, 0, 2),  # 84 channel low high; its "multiple targets" needs less, for adjacent channels
-    "ssc32": Framing(4, 5, 4),  # #12P1500 for each, then T500 and a carriage return
+    "maestro": Framing(2, 0, 2),  # 84 channel low high; for adjacent channels "multiple targets" needs fewer bytes
+    "ssc32": Framing(4, 5, 4),  # #12P1500 for each channel, then T500 and a carriage return
 }
