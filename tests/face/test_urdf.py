@@ -55,7 +55,7 @@ def test_links_shapes_sizes_and_colours_are_those_of_the_file(tmp_path):
         ('joint="turn" m', 'joint="push" m', "joint 'push' mimics itself"),
         ('<parent link="arm"/>', '<parent link="slide"/>', "joint 'push' does not hang on the robot's first link"),
         ('<child link="slide"/>', '<child link="arm"/>', "joint 'push' has the child 'arm', which is that of turn too"),
-        ('<link name="slide"/>', '<link name="slide"/><link name="loose"/>', "link 'loose' hangs on nothing"),
+        ('<link name="slide"/>', '<link name="slide"/><link name="loose"/>', "link 'loose' has no parent joint"),
     ],
 )
 def test_a_broken_file_is_one_line_that_names_what_is_wrong(tmp_path, old, new, told):
