@@ -38,7 +38,7 @@ def test_stream_equals_offline_for_any_chunking(model, cuts):
         new, past = model.step(NOISE[at : at + size], past)
         rows.append(new)
         at += size
-    np.testing.assert_allclose(np.concatenate(rows), whole, atol=1e-5)
+    np.testing.assert_allclose(np.concatenate(rows), whole, atol=1e-4)
     assert whole.shape == (25, 16) and len(past) >= len(first) and not first.any()
 
 
@@ -60,7 +60,7 @@ def test_a_hop_of_frames_streams_as_it_is_offline(folder, hop):
 
 def test_rows_forget_2_s_ago_come_at_the_rate_of_the_data_and_do_not_depend_on_loudness(model):
     long = np.concatenate([NOISE, NOISE, NOISE, NOISE])
-    np.testing.assert_allclose(model.of_recording(long)[60:75], model.of_recording(long[640 * 9 :])[51:66], atol=1e-5)
+    np.testing.assert_allclose(model.of_recording(long)[60:75], model.of_recording(long[640 * 9 :])[51:66], atol=1e-4)
     assert model.of_recording(NOISE, fps=30).shape == (30, 16)
     np.testing.assert_allclose(model.of_recording(NOISE)[-1], model.of_recording(0.2 * NOISE)[-1], atol=1e-2)
 
