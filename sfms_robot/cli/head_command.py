@@ -246,10 +246,10 @@ def fit(
     yes: bool = YES,
     json: bool = JSON,
 ) -> None:
-    """Learn the drives of a face from its joints and the track of a face tracker before it.
+    """Learn the drives of a face from its joints and from the track of a face tracker in front of it.
 
-    Written as the fit of this build, beside the shipped file. On a real port --babble records the joints alone: track
-    the face with a camera of yours, put the track beside it as face.csv, and fit the recording.
+    The fit of this build is written to your overlay of the head's file. On a real port --babble records only the joints:
+    track the face with your camera, put the track into the same folder as face.csv, and fit the recording.
     """
     from sfms_robot.app.head.fit import babble as move
     from sfms_robot.app.head.fit import fit_head, see_virtual_face

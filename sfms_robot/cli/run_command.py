@@ -84,7 +84,7 @@ def run(
     addressed: str = OF_LISTENER(
         "sense",
         metavar="sense|assume|never",
-        help="Whether the head is spoken to: sense (by the person's look; yes without a face), assume (always), never.",
+        help="Rule for being spoken to: sense (by the person's look; yes without a face), assume (always), never.",
     ),
     engine: str = OF_LISTENER(
         "auto",
