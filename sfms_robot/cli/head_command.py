@@ -248,7 +248,7 @@ def fit(
 ) -> None:
     """Learn the drives of a face from its joints and from the track of a face tracker in front of it.
 
-    The fit of this build is written to your overlay of the head's file. On a real port --babble records only the joints:
+    The fit of this build is written to your overlay of the head's file. On a real port --babble records only joints:
     track the face with your camera, put the track into the same folder as face.csv, and fit the recording.
     """
     from sfms_robot.app.head.fit import babble as move
