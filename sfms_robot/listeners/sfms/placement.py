@@ -94,23 +94,26 @@ class Tracks:
 def tracks(motion: Tensor, member: Tensor, most: int) -> Tracks:
     """Return the tracks of motion (B, T, C) with groups `member` (G, C) and `most` principal curves each."""
     centred = motion - motion.mean(1, keepdim=True)
-    found, widest = [], int(member.sum(1).max())
+    groups = []
     for row in member:
         own = centred[..., row > 0.5]  # (B, T, c)
-        own = own / own.square().sum(-1).mean(1).sqrt().clamp(min=STILL)[:, None, None]
-        found.append((_principal(own, most), F.pad(own, (0, widest - own.shape[-1]))))  # zeros add no error
-    curves, padded = (torch.stack(part, 1).flatten(0, 1) for part in zip(*found, strict=True))
-    return Tracks(curves, Segments(*(part.float() for part in segments(padded))))
+        groups.append(own / own.square().sum(-1).mean(1).sqrt().clamp(min=STILL)[:, None, None])
+    cost = segments(_padded(groups, max(own.shape[-1] for own in groups)))  # zeros add no error
+    return Tracks(_padded([_principal(own, most) for own in groups], most), Segments(*(part.float() for part in cost)))
+
+
+def _padded(groups: Sequence[Tensor], width: int) -> Tensor:
+    """Return windows (B * G, T, width) of G groups (B, T, c), sample by sample, with zeros behind their c columns."""
+    return torch.stack([F.pad(own, (0, width - own.shape[-1])) for own in groups], 1).flatten(0, 1)
 
 
 def _principal(own: Tensor, most: int) -> Tensor:
-    """Return the first principal curves (B, T, most) of centred channels (B, T, c), zeros where c is smaller."""
-    channels = own.shape[-1]
-    if channels > 1:  # in double precision, which autocast does not change
+    """Return the first principal curves of centred channels (B, T, c): (B, T, most), or (B, T, c) if c is smaller."""
+    if own.shape[-1] > 1:  # in double precision, which autocast does not change
         wide = own.double()
         axes = torch.linalg.eigh(wide.transpose(1, 2) @ wide).eigenvectors  # ascending
         own = (wide @ axes.flip(-1)[..., :most]).to(own.dtype)
-    return F.pad(own, (0, most - own.shape[-1]))
+    return own
 
 
 class ConditionalScore(nn.Module):
@@ -269,12 +272,12 @@ def place_learned(
     Categorical(exp(s / temperature)), as in equation (6), so the noise grows with the temperature.
     """
     if temperature == 0.0:
-        hard = torch.stack([_top_k(scores[..., g], c) for g, c in enumerate(k)], dim=-1)
+        hard = _top_k(scores, k)
         return hard, hard
     gumbel = -torch.log(-torch.log(_uniform_like(scores, generator)))
     noisy = scores + gumbel * (temperature if tempered else 1.0)  # lines 3 to 6: s_i + g_i
     relaxed = _relaxed_k_hot(noisy, k, temperature)
-    hard = torch.stack([_top_k(relaxed[..., g], c) for g, c in enumerate(k)], dim=-1)  # lines 14 to 16
+    hard = _top_k(relaxed, k)  # lines 14 to 16
     return hard - relaxed.detach() + relaxed, relaxed  # line 18
 
 
@@ -302,7 +305,7 @@ def _uniform_like(scores: Tensor, generator: torch.Generator | None) -> Tensor:
 def _relaxed_k_hot(noisy: Tensor, k: Sequence[int], temperature: float) -> Tensor:
     """Return the sums (B, T, G) of k softmaxes, each without the frames that the earlier ones chose (lines 7 to 13)."""
     k_hot = one_hot = torch.zeros_like(noisy)
-    counts = noisy.new_tensor(k)
+    counts = torch.tensor(k).to(noisy.device, non_blocking=True)
     for step in range(max(k)):
         noisy = noisy + torch.log(torch.clamp(1.0 - one_hot, min=EPSILON))  # lines 9, 10
         one_hot = torch.softmax(noisy / temperature, dim=1)  # line 11
@@ -310,9 +313,12 @@ def _relaxed_k_hot(noisy: Tensor, k: Sequence[int], temperature: float) -> Tenso
     return k_hot
 
 
-def _top_k(scores: Tensor, count: int) -> Tensor:
-    _check(count, scores.shape[-1])
-    return torch.zeros_like(scores).scatter(-1, scores.topk(count, dim=-1).indices, 1.0)
+def _top_k(scores: Tensor, k: Sequence[int]) -> Tensor:
+    mask = torch.zeros_like(scores)
+    for group, count in enumerate(k):
+        _check(count, scores.shape[1])
+        mask[..., group].scatter_(1, scores[..., group].topk(count, dim=1).indices, 1.0)
+    return mask
 
 
 # --- One keyframe after another ---------------------------------------------------------------------------------------
