@@ -136,12 +136,12 @@ def compare_installations(name: str, against: Path) -> Rows:
         for found, env in ((ours, None), (theirs, environment(against))):
             done = subprocess.run(
                 [sys.executable, *MAIN, "bench", name, "--json"],
-                capture_output=True, text=True, check=False, env=env,
+                capture_output=True, text=True, env=env,
                 cwd=tempfile.gettempdir(),  # child processes import from their current folder first
             )  # fmt: skip
             if done.returncode > 1 or not done.stdout:  # 1: a figure misses its limit
-                raise ConfigError(f"bench {name}: {(done.stderr.strip().splitlines() or ['?'])[-1]}")
-            for key, each in json.loads(done.stdout.splitlines()[-1]).items():
+                raise ConfigError(f"bench {name}: {last_line(done.stderr)}")
+            for key, each in json.loads(last_line(done.stdout)).items():
                 if not isinstance(each, dict) or "median" not in each:
                     raise ConfigError(f"--against {against}: 'bench {name}' has no rows to compare")
                 found.setdefault(key, []).append(each["median"])
@@ -157,14 +157,16 @@ def package_environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
+def last_line(text: str) -> str:
+    """Return the last line of a child's output, "" if it has none."""
+    return text.strip().rpartition("\n")[2]
+
+
 def result_of(returncode: int | None, said: str, out: str, name: str) -> Any:
     """Return the JSON in the last line of `out`. Raises BusError with the last error line of a child that failed."""
-    lines = out.splitlines()
-    if returncode or not lines:
-        raise BusError(
-            f"bench {name}: the run failed with exit code {returncode}: {(said.strip().splitlines() or ['?'])[-1]}"
-        )
-    return json.loads(lines[-1])
+    if returncode or not out:
+        raise BusError(f"bench {name}: the run failed with exit code {returncode}: {last_line(said)}")
+    return json.loads(last_line(out))
 
 
 def processor_time_s(pid: int, thread: int | None = None) -> float:

@@ -48,7 +48,16 @@ from sfms_robot.lab.bench.live_bench import (
     load,
     patient_head,
 )
-from sfms_robot.lab.bench.measure import HEAD, LISTENER, MAIN, BenchResult, Say, children_of, package_environment
+from sfms_robot.lab.bench.measure import (
+    HEAD,
+    LISTENER,
+    MAIN,
+    BenchResult,
+    Say,
+    children_of,
+    last_line,
+    package_environment,
+)
 from sfms_robot.lab.bench.throttle_bench import OUT, SAID, Process, held
 
 KINDS: Final = ("killed", "stopped", "cut", "unplugged")
@@ -291,8 +300,8 @@ def _running(folder: Path, chain: Chain, person: LivePerson, audio: Audio) -> It
         ends_s, waits = time.monotonic() + _START_S, True
         while waits:
             if time.monotonic() >= ends_s or process.poll() is not None:
-                lines = (folder / SAID).read_text(encoding="utf-8").strip().splitlines()
-                raise BusError(f"bench live: the run did not begin to listen: {lines[-1:]}")
+                said = (folder / SAID).read_text(encoding="utf-8")
+                raise BusError(f"bench live: the run did not begin to listen: {last_line(said)}")
             time.sleep(_LOOK_S)
             with suppress(OSError):  # the server is not up yet
                 status = _status(port)
@@ -308,5 +317,5 @@ def _ended(process: Process, folder: Path) -> Figures:
         process.wait(_END_S)
     except subprocess.TimeoutExpired as error:
         raise BusError(f"bench live: the run did not end within {_END_S:g} s of Ctrl-C") from error
-    report: Figures = json.loads((folder / OUT).read_text(encoding="utf-8").splitlines()[-1])
+    report: Figures = json.loads(last_line((folder / OUT).read_text(encoding="utf-8")))
     return report

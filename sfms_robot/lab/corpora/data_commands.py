@@ -211,9 +211,10 @@ def convert_data(
         raise ConfigError(f"{out}: is not empty: dyads of two conversions would be mixed")
     residual = Residual()
     sets = [formats.scan_split(found, place, name, order) for name in formats.split_names(found, place)]
-    for one in sets:
-        if order is None and (said := formats.wrong_order(one, found.order)):
-            raise ConfigError(f"{one.split}: {said}")
+    if order is None:
+        for one in sets:
+            if said := formats.wrong_order(one, found.order):
+                raise ConfigError(f"{one.split}: {said}")
     licence = next((one.licence for one in sets if one.licence), None)
     out.mkdir(parents=True, exist_ok=True)
     origin = {"layout": found.name, "folder": str(place.resolve()), "licence": licence}
