@@ -189,7 +189,7 @@ class Connection:
         try:
             session = zenoh.open(self._config)
             self._begin(session)
-        except Exception as error:  # zenoh raises plain exceptions, too
+        except zenoh.ZError as error:
             with self._changed:
                 self.problem = f"zenoh cannot connect: {_first_line(error)}"
                 self._changed.notify_all()

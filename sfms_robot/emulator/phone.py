@@ -107,6 +107,8 @@ def main(arguments: Sequence[str]) -> None:
     phone = EmulatedPhone(*place)
     try:
         phone.play()
+    except OSError as error:
+        raise ConfigError(f"{target!r}: {error.strerror}") from error
     finally:
         phone.close()
 
@@ -116,5 +118,5 @@ if __name__ == "__main__":
         main(sys.argv[1:])
     except KeyboardInterrupt:
         pass
-    except (ConfigError, OSError) as problem:
+    except ConfigError as problem:
         sys.exit(str(problem))

@@ -54,6 +54,8 @@ def test_playing_keeps_the_pace(phone):
 def test_a_place_that_is_none_is_one_line(target):
     with pytest.raises(ConfigError, match="is not an address to send to"):
         main([target])
+    with pytest.raises(ConfigError, match=r"'no\.such\.machine\.invalid:1': "):
+        main(["no.such.machine.invalid:1"])
 
 
 def test_a_file_that_is_none_is_one_line(tmp_path):

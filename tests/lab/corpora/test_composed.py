@@ -191,7 +191,6 @@ def test_written_sets_read_back(tables, tmp_path):
     assert {event.kind for event in spoken.events} >= {"blink"}
 
 
-# --- what the others do -----------------------------------------------------------------------------------------
 def test_the_speaker_looks_at_the_listener_when_it_was_annotated(made):
     toward, aside = [], []
     for dyad in [dyad for split in SPLITS for dyad in made[split]]:
@@ -258,7 +257,6 @@ def test_no_voice_take_or_series_is_in_two_parts(motions):
     assert [voice.name for voice in parts["test"]] == ["1114_3_16"]
 
 
-# --- the listener's motion --------------------------------------------------------------------------------------
 @pytest.mark.parametrize("seed", range(6))
 def test_motion_stays_in_range_and_never_jumps(motions, seed):
     motion = act(busy(), motions["train"], np.random.default_rng(seed)).motion
