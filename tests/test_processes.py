@@ -21,7 +21,6 @@ LARGE = 1_000_000  # bytes: more than any pipe takes
 LOOSE = {name: "7" for name in processes.ONE_THREAD}  # BLAS and OpenMP read them when they are loaded
 
 
-# --- one end of a pipe ------------------------------------------------------------------------------------------------
 def writer_and_reader(kept=1):
     reading, writing = os.pipe()
     return processes.PipeWriter(os.fdopen(writing, "wb"), kept, "test"), os.fdopen(reading, "rb")
@@ -72,7 +71,6 @@ def test_a_reader_that_has_ended_costs_nothing():
     writer.close()
 
 
-# --- a real child -----------------------------------------------------------------------------------------------------
 def threads(task=0):
     """Return the thread settings of this process, and the threads that torch uses."""
     import torch
@@ -195,7 +193,6 @@ def test_a_child_whose_parent_ends_before_its_first_message_ends_without_a_word(
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-# --- supervision, in virtual time -------------------------------------------------------------------------------------
 class Fake:
     """A child that only knows whether it was killed."""
 
@@ -322,7 +319,6 @@ def test_a_page_is_not_started_again_and_a_break_of_the_run_itself_is_no_silence
     assert [each.getMessage() for each in caplog.records] == ["test: its process died; the run continues without it"]
 
 
-# --- pools and priority -----------------------------------------------------------------------------------------------
 def test_a_process_of_a_pool_computes_with_one_thread(monkeypatch):
     for name, value in LOOSE.items():
         monkeypatch.setenv(name, value)

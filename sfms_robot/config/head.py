@@ -30,6 +30,7 @@ from sfms_robot.frames import LATERAL_POSE, Doubles
 from sfms_robot.ranges import Range
 
 VERSION: Final = 1  # version of the format of head files
+IN_OPPOSITE: Final = {"min_deg": "max_deg", "max_deg": "min_deg", "rest_deg": "rest_deg"}  # key of the twin, negated
 NOT_SHARED: Final = ("id", "note", "drive", "mirror_of", "mirror_sense")  # keys that a twin does not pass on
 TRAVEL: Final = 0.2  # share of its travel, around rest, that a joint may use before it is calibrated
 PACE: Final = 0.3
@@ -262,7 +263,7 @@ def _seen_in_mirror(twin: Report, sense: Any) -> Report:
     out = {key: value for key, value in twin.items() if key not in NOT_SHARED}
     if sense != "opposite":  # a servo on the other side of the head turns the other way for the same motion
         return {**out, "sign": -1 if out.get("sign", 1) == 1 else 1}
-    for key, other in (("min_deg", "max_deg"), ("max_deg", "min_deg"), ("rest_deg", "rest_deg")):
+    for key, other in IN_OPPOSITE.items():
         if isinstance(twin.get(other), (int, float)):
             out[key] = -twin[other]
     return out

@@ -26,7 +26,7 @@ from pydantic import Field
 from sfms_robot.config.base import Model, Name, Problems, load, parse, read, with_number
 from sfms_robot.config.consistency import problems
 from sfms_robot.config.firmware import load_firmware_map
-from sfms_robot.config.head import NOT_SHARED, Head, load_head
+from sfms_robot.config.head import IN_OPPOSITE, Head, load_head
 from sfms_robot.config.joint import Expression, Joint, Safety
 from sfms_robot.data import Names, data_dir, head_file, user_dir, write_whole
 from sfms_robot.errors import ConfigError
@@ -315,7 +315,8 @@ def _origin(key: str, config: Joint, own: Facts, raw: Facts) -> str:
     if key in own:
         return "head file"
     twin = config.mirror_of
-    shared = key not in NOT_SHARED or key == "drive"
-    if twin is not None and shared and (key in raw["joints"][twin] or key == "sign"):
+    if config.mirror_sense == "opposite":
+        key = IN_OPPOSITE.get(key, key)
+    if twin is not None and (key in raw["joints"][twin] or key == "sign"):
         return f"mirror of {twin}"
     return "joint_defaults" if key in (raw.get("joint_defaults") or {}) else "built in"

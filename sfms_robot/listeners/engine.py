@@ -241,10 +241,11 @@ def read_graphs(folder: Path, settings: config.ListenerSettings, integers: bool 
     networks, listed.networks = listed.networks, {}
     for name in {network.removesuffix(".int8") for network in networks}:
         chosen = f"{name}.int8" if integers and f"{name}.int8" in networks else name
-        graph, network = folder / FOLDER / f"{chosen}.onnx", networks[chosen]
+        graph = folder / FOLDER / f"{chosen}.onnx"
         try:
+            network = networks[chosen]
             network.data = graph.read_bytes()
-        except OSError:
+        except (OSError, KeyError):
             raise ModelError(f"{graph}: no such graph; {remedy}") from None
         if hashlib.sha256(network.data).hexdigest() != network.sha256:
             raise ModelError(f"{graph}: cut short, or of another model than {MANIFEST} next to it; {remedy}")

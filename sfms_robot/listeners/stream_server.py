@@ -202,11 +202,9 @@ class StreamServer:
             if (reason := self._full()) is not None:
                 return Refusal(reason, final=False)
             memory = self._listener.start(join.seed)
-            known = _Stream(
-                name=secrets.token_hex(6), client=join.client, memory=memory, heard_s=now_s, calmness=calmness
-            )
+            known = _Stream(name=secrets.token_hex(6), client=join.client, memory=memory, heard_s=now_s)
             self._streams[known.name] = known
-        known.heard_s = now_s
+        known.heard_s, known.calmness = now_s, calmness or known.calmness
         return Welcome(
             stream=known.name,
             server=self._server,

@@ -23,7 +23,8 @@ import http.client
 import math
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Final
 
 import numpy as np
@@ -32,7 +33,7 @@ import orjson
 from sfms_robot.config.head import other_side
 from sfms_robot.errors import OutputError
 from sfms_robot.frames import CHANNELS, POSE, Doubles, Floats
-from sfms_robot.outputs.websocket_peer import CONNECT_S, Message, WebSocketOutput
+from sfms_robot.outputs.websocket_peer import CONNECT_S, SILENT_S, Message, WebSocketOutput
 from sfms_robot.ports import ChannelLimit, Facts, OutputFrame
 from sfms_robot.signals.minimum_jerk import ease
 from sfms_robot.signals.rotations import rotation
@@ -42,6 +43,7 @@ _SETTLE_S: Final = 0.2  # until the daemon accepts targets again after the way t
 _KNOWN_MAJOR: Final = "1"  # major version of the daemon
 _NEAR_RAD, _NEAR_M = 0.2, 0.02  # a head this close to its goal is near it
 _APART_S: Final = 0.5  # longest time not near the goal; then the output eases in again, which the daemon does not do
+_NO_POSE: Final = "reports no head_pose"
 _DRIVEN: Final = "another move or program drives it, or something holds its head"
 
 LEAN_RAD: Final = math.radians(35)
@@ -74,17 +76,17 @@ _OFFSET: Final = ChannelLimit(-math.radians(20), math.radians(20), math.radians(
 def in_reach(pose: Doubles) -> Doubles:
     """Return a pose (6,) within reach of the legs: less lean and shift in the same direction, the same yaw."""
     out = pose.copy()
-    lean = float(np.hypot(pose[0], pose[1]))
+    lean = math.hypot(*pose[:2])
     out[:2] *= min(1.0, LEAN_RAD / max(lean, 1e-9))
-    shift, most = float(np.linalg.norm(pose[3:])), SHIFT_M * max(0.0, 1.0 - lean / LEAN_RAD)
+    shift, most = math.hypot(*pose[3:]), SHIFT_M * max(0.0, 1.0 - lean / LEAN_RAD)
     out[3:] *= min(1.0, most / max(shift, 1e-9))
     return out
 
 
 def body_yaw(yaw_rad: float) -> float:
     """Return the body's part of a yaw: the part beyond that of the neck."""
-    beyond = yaw_rad - min(max(yaw_rad, -_NECK_RAD), _NECK_RAD)
-    return min(max(beyond, -_BODY_RAD), _BODY_RAD)
+    beyond = yaw_rad - np.clip(yaw_rad, -_NECK_RAD, _NECK_RAD)
+    return float(np.clip(beyond, -_BODY_RAD, _BODY_RAD))
 
 
 def antennas(motion: Floats) -> Doubles:
@@ -197,7 +199,7 @@ class ReachyMini(ReachyDaemon):
         self._sent = deque[tuple[float, float]](maxlen=_HISTORY)
         self._reported = deque[tuple[float, float]](maxlen=_HISTORY)
         self._goal = np.eye(4)  # the pose that was sent last
-        self._together_s: float | None = None  # time at which the head was last near it
+        self._together_s = 0.0  # time at which the head was last near it
 
     def greet(self) -> None:
         self.check()
@@ -207,14 +209,13 @@ class ReachyMini(ReachyDaemon):
         began_s = time.monotonic()
         neutral = {"head": np.eye(4).ravel(), "antennas": _REST_RAD, "body_yaw": 0.0}
         self.say({"type": "goto_target", **neutral, "duration": self.neutral_s})
-        at = None
-        for message in self.link.until(began_s + self.neutral_s + _SETTLE_S):
-            at = _reported(message) if message.get("type") == "head_pose" else at
-        if at is None:
-            raise OutputError("reports no head_pose")
-        if not _near(at, np.eye(4)):
+        poses = _reported(self.link.until(began_s + self.neutral_s + _SETTLE_S))
+        if not len(poses):
+            raise OutputError(_NO_POSE)
+        if not _near(poses[-1], np.eye(4)):
             raise OutputError(f"did not go to neutral: {_DRIVEN}")
-        self._goal, self._together_s = np.eye(4), None
+        self._goal, self._together_s = np.eye(4), time.monotonic()
+        self._reported.append((self._together_s, _pitch(poses[-1])))
 
     def message(self, frame: OutputFrame, now_s: float) -> Message:
         pose = in_reach(frame.motion[POSE].astype(np.float64))
@@ -231,10 +232,12 @@ class ReachyMini(ReachyDaemon):
 
     def heard(self, messages: Sequence[Message], now_s: float) -> None:
         super().heard(messages, now_s)
-        poses = [_reported(each) for each in messages if each.get("type") == "head_pose"]
-        for back, pose in zip(range(len(poses) - 1, -1, -1), poses, strict=True):  # the newest arrived now
-            self._reported.append((now_s - back / RATE_HZ, _pitch(pose)))
-        if self._together_s is None or not poses or _near(poses[-1], self._goal):
+        poses = _reported(messages)
+        for place, pose in enumerate(poses, 1 - len(poses)):  # the newest arrived now
+            self._reported.append((now_s + place / RATE_HZ, _pitch(pose)))
+        if now_s - self._reported[-1][0] > SILENT_S:
+            raise OutputError(_NO_POSE)
+        if not len(poses) or _near(poses[-1], self._goal):
             self._together_s = now_s
         elif now_s - self._together_s > _APART_S:
             raise OutputError(f"does not follow: {_DRIVEN}")
@@ -297,15 +300,14 @@ def _near(pose: Doubles, goal: Doubles) -> bool:
 
 
 def _pitch(pose: Doubles) -> float:
-    return -math.asin(min(max(float(pose[2, 0]), -1.0), 1.0))
+    return -math.asin(np.clip(pose[2, 0], -1.0, 1.0))
 
 
-def _reported(message: Message) -> Doubles:
-    """Return the pose (4, 4) of a message. Raises OutputError for another shape."""
-    try:
-        pose = np.array(message["head_pose"], dtype=np.float64)
-    except (KeyError, TypeError, ValueError):
-        pose = np.zeros(0)
-    if pose.shape != (4, 4) or not np.isfinite(pose).all():
-        raise OutputError("reports a head_pose that is not 4x4 numbers")
-    return pose
+def _reported(messages: Iterable[Message]) -> Doubles:
+    """Return the poses (n, 4, 4) among messages. Raises OutputError for another shape."""
+    found = [message.get("head_pose") for message in messages if message.get("type") == "head_pose"]
+    with suppress(TypeError, ValueError):
+        poses = np.array(found, dtype=np.float64).reshape(len(found), 4, 4)
+        if np.isfinite(poses).all():
+            return poses
+    raise OutputError("reports a head_pose that is not 4x4 numbers")

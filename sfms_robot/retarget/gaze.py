@@ -253,7 +253,7 @@ class GazeTarget:
             return replace(state, aside_rad=np.zeros(2)) if away else state
         dt_s = now_s - state.now_s
         wanted_hz = self._often / manner.home_s
-        lacking = min(max(1.0 - state.listener_hz / wanted_hz, 0.0), 1.0)
+        lacking = max(1.0 - state.listener_hz / wanted_hz, 0.0)
         left = state.left - (dt_s / manner.away_s if away else dt_s * wanted_hz * lacking)
         if left > 0 or (state.listener_away and not away):
             return replace(state, left=left)

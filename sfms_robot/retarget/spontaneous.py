@@ -144,7 +144,7 @@ class IdleFiller:
         onset = level > _BLINK_ON and not blink.closed
         closed = level > (_BLINK_OFF if blink.closed else _BLINK_ON)
         rate = blink.rate * math.exp(-dt_s * wanted / 5) + (wanted / 5 if onset else 0.0)
-        lacking = min(max(1.0 - rate / (ENOUGH * wanted), 0.0), 1.0)
+        lacking = max(1.0 - rate / (ENOUGH * wanted), 0.0)
         clock = 0.0 if onset else blink.clock + dt_s * wanted * lacking
         seen_s = state.now_s if closed else blink.seen_s
         blink = replace(blink, rate=rate, clock=clock, closed=closed, seen_s=seen_s)

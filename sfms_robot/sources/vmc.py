@@ -236,7 +236,9 @@ class VmcDecoder(Decoder):
                 if name.lower() in self._bones:
                     self._turn(name.lower(), quaternion[:4])
             case b"/VMC/Ext/OK", [loaded, *more]:
-                self._track(loaded != 0 and (len(more) < 3 or more[2] != 0))
+                blind = loaded == 0 or more[2:3] == [0]
+                self._counts["lost_tracking"] += blind and not self.blind
+                self.blind = blind
             case _:
                 raise PacketError("values of other types")
 
@@ -267,10 +269,6 @@ class VmcDecoder(Decoder):
         values = np.array(self._values, dtype=np.float32)
         self._shapes = values[:_ARKIT] if self._has_arkit else (values[_ARKIT:, None] * _AS_ARKIT).max(axis=0)
         self._changed = True
-
-    def _track(self, tracking: bool) -> None:
-        self._counts["lost_tracking"] += not self.blind and not tracking
-        self.blind = not tracking
 
     def _face(self) -> Floats | None:
         """Return the face (58,) if it has changed since the last call, else None."""

@@ -77,7 +77,6 @@ def fix_of(report: dict, problem: str) -> str:
     return next(each["fix"] for each in report["findings"] if problem in each["problem"])
 
 
-# --- chains -----------------------------------------------------------------------------------------------------
 def test_a_sound_chain_is_fit_to_run_and_looking_changes_nothing():
     with patient() as sick:
         report = sick.examined()
@@ -270,7 +269,6 @@ def test_a_maestro_answers_where_its_crc_setting_is_that_of_the_heads_file(store
         assert "Enable CRC" in fix_of(report, "CRC")
 
 
-# --- ports ------------------------------------------------------------------------------------------------------
 def no_port(path: str) -> dict:
     line = Line(device=path, shown=path, family="dynamixel2", baud=BAUD, rate_hz=100.0, wanted={})
     return examine_line(line, partial(SerialPort, path, BAUD, RealClock()))
@@ -291,7 +289,6 @@ def test_the_port_of_a_head_is_opened_as_its_run_opens_it(tmp_path):
     assert report["exit_code"] == 3 and "rs485 = 'rts': this device has no RTS line" in str(report["findings"])
 
 
-# --- what servos have stored ------------------------------------------------------------------------------------
 NARROW = {"min_position_limit": 1900, "max_position_limit": 2200}
 
 
@@ -335,7 +332,6 @@ def test_what_acts_by_itself_or_shifts_angles_is_told_and_without_a_head_left_al
     assert len(told(report, "warning")) == 2 and report["fixed"] == [] and report["exit_code"] == 0
 
 
-# --- the budget and the wording ---------------------------------------------------------------------------------
 def test_every_command_that_is_proposed_is_one_that_the_program_has():
     servos = [EmulatedServo(1, baud=57_600), EmulatedServo(2), EmulatedServo(4)]
     with patient(*servos, count=3) as sick:

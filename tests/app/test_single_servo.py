@@ -52,7 +52,6 @@ def put(wire: Wire, servo: int, register: str, value: int) -> None:
     single.write_register(wire.find(servo), register, str(value), yes)
 
 
-# --- finding ----------------------------------------------------------------------------------------------------
 def test_a_scan_finds_every_servo_at_its_own_rate_and_two_with_one_id(three):
     wire, chain = three
     steps = []
@@ -92,7 +91,6 @@ def test_an_id_out_of_range_and_one_of_two_servos_are_left_alone(three):
         single.set_id(wire.find(1), 5, yes, in_chain=True)
 
 
-# --- registers --------------------------------------------------------------------------------------------------
 def test_registers_are_read_by_name_in_raw_and_unit(three):
     wire, _ = three
     (goal, volt) = single.read_registers(wire.find(2), ["present_position", "voltage"])
@@ -154,7 +152,6 @@ def test_a_servo_that_answers_pings_only_is_said_to_be_one(three):
     assert single.read_registers(seen, ["led"])[0]["raw"] == 1
 
 
-# --- id, rate, start over ---------------------------------------------------------------------------------------
 def test_an_id_is_changed_and_on_a_wire_of_several_needs_to_be_meant(three):
     with wire_on(EmulatedServo(1, baud=57_600)) as (wire, _):
         changed = single.set_id(wire.find(1), 5, yes)
@@ -251,16 +248,12 @@ def test_a_factory_reset_takes_no_other_servos_id():
         assert wire.find(7).baud == 1_000_000
 
 
-# --- watching ---------------------------------------------------------------------------------------------------
-
-
 def test_the_second_number_of_an_sts_firmware_is_read():
     with wire_on(EmulatedServo(1, "sts3215", registers={"firmware_minor": 9}), family="feetech") as (wire, _):
         row = wire.find(1).row()
         assert (row["firmware"], row["firmware_minor"]) == (53, 9)
 
 
-# --- ports ------------------------------------------------------------------------------------------------------
 def test_emulated_servos_confirm_a_silence_as_in_a_run():
     with open_wire("sim", "dynamixel2", None, "op3_head") as wire:
         assert isinstance(wire.port, EmulatedPort)
@@ -288,7 +281,6 @@ def test_rates_that_the_adapter_cannot_do_are_passed_over_and_never_set():
         port.close()
 
 
-# --- dump and restore -------------------------------------------------------------------------------------------
 SET = {
     "xl330-m288": ("dynamixel2", {"homing_offset": 120, "min_position_limit": 900, "current_limit": 800}),
     "ax-12a": ("dynamixel1", {"cw_angle_limit": 200, "ccw_angle_limit": 800}),
@@ -338,7 +330,6 @@ def test_nothing_is_written_unasked_or_under_torque_or_to_another_model():
         assert [name for name, *_ in single.differences(wire.find(2), kept)] == ["homing_offset"]
 
 
-# --- another protocol -------------------------------------------------------------------------------------------
 SPOKEN = {"xl330-m288": "dynamixel2", "ax-12a": "dynamixel1", "sts3215": "feetech"}
 ASKED = ("dynamixel2", "dynamixel1", "feetech")
 

@@ -10,7 +10,7 @@ import yaml
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.config import overlay as overlays
 from sfms_robot.config.joint import Expression
-from sfms_robot.data import find
+from sfms_robot.data import find, head_file
 from sfms_robot.errors import ConfigError
 from sfms_robot.motion.calibration import Calibration
 
@@ -115,6 +115,14 @@ def test_show_tells_calibrated_and_fitted_values_from_those_of_the_file():
     assert told["jaw"]["max_deg"][1] == "calibrate 2026-05-17" and told["jaw"]["id"][1] == "head file"
     assert told[FITTED]["drive"][1] == "fit 2026-05-17" and told["lid_left"]["drive"][1] == "head file"
     assert refused == []
+
+
+def test_show_names_the_origin_of_an_end_that_a_twin_of_the_opposite_sense_has(tmp_path):
+    raw = yaml.safe_load(head_file("face28").read_text())
+    raw["joint_defaults"]["max_deg"] = raw["joints"]["eye_pan_left"].pop("max_deg")
+    (tmp_path / "head.yaml").write_text(yaml.safe_dump(raw))
+    told = overlays.provenance(str(tmp_path))[0]["eye_pan_right"]
+    assert [told[key][1] for key in ("min_deg", "max_deg")] == ["joint_defaults", "mirror of eye_pan_left"]
 
 
 def test_show_tells_what_does_not_hold():

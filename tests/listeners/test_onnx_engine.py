@@ -120,6 +120,9 @@ def test_a_manifest_that_is_none_is_refused_and_with_auto_leaves_the_listener_to
     for text in ("[]", "{", json.dumps(whole | {"format": 99}), json.dumps(whole | {"networks": {"next": {}}})):
         (copied / "onnx" / "graphs.json").write_text(text)
         assert "graphs.json: " in refused(copied)
+    networks = {f"{name}.int8": network for name, network in whole["networks"].items()}
+    (copied / "onnx" / "graphs.json").write_text(json.dumps(whole | {"networks": networks}))
+    assert ".onnx: no such graph" in refused(copied)
     (copied / "onnx" / "graphs.json").write_text("{")
     assert engine_name(load_listener(copied)) == "torch"
     assert "torch in place of onnx" in caplog.text

@@ -8,6 +8,7 @@ import pytest
 from remote_rig import SILENCE, Counting, Network, Robot, Server
 from tiny_sfms import plans_of, speech, tiny_listener
 
+from sfms_robot.config.listener import Calmness
 from sfms_robot.frames import FRAME_S, SpeakerFrame
 from sfms_robot.listeners import remote_messages as messages
 from sfms_robot.listeners.capacity import Capacity, measure_capacity
@@ -129,9 +130,14 @@ def test_who_is_silent_is_given_up_and_told_when_it_speaks_again():
 
 
 def test_who_asks_again_keeps_its_stream_and_calmness_that_cannot_be_is_refused():
-    server = StreamServer(Counting(), "counting")
-    assert joined(server, "a") == joined(server, "a") and server.heads == 1
-    server = StreamServer(Counting(), "counting")
+    server, heeded = StreamServer(listener := Counting(), "counting"), []
+    listener.calmed = lambda memory, calmness: heeded.append(calmness) or memory
+    stream = joined(server, "a")
+    server.join(messages.words_message(messages.Join("a", 0, {"nod": 5.0})), 0.0)
+    assert stream == joined(server, "a") and server.heads == 1
+    server.receive(stream, frame(0), 0.0)
+    stepped(server)
+    assert heeded == [Calmness(nod=5.0)]
     refusal = messages.parse_words(server.join(messages.words_message(messages.Join("a", 0, {"nod": 1e9})), 0.0))
     assert refusal.final and "nod" in refusal.reason
 

@@ -231,6 +231,16 @@ def test_reachy_mini_that_cannot_be_driven_is_one_line(fake, line):
         ReachyMini(peer.address).open()
 
 
+@pytest.mark.usefixtures("quick")
+def test_a_reachy_mini_that_reports_no_poses_any_more_is_lost():
+    with daemon(answer=lambda message: (AWAKE, HOME)[: 1 + (message["type"] == "goto_target")]) as fake:
+        output = ReachyMini(fake.address)
+        output.open()
+        with pytest.raises(OutputError, match="reports no head_pose"):
+            output.send(frame_of(), time.monotonic() + websocket_peer.SILENT_S)
+        output.close()
+
+
 def test_an_overlay_runs_beside_an_app_and_ends_at_0():
     with daemon(lock="local_app") as fake:
         output = ReachyMiniOverlay(fake.address)

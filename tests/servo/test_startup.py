@@ -48,7 +48,6 @@ class Rig(ServoRig):
         return {each.register: each for each in contradictions(self.values(), self.table, self.needs[0])}
 
 
-# --- who is there -----------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("model", MODELS)
 def test_absent_servos_do_not_stop_the_others(model):
     rig = Rig(model, {"id": 1}, {"id": 3}, wanted=[1, 2, 3, 4])
@@ -72,7 +71,6 @@ def test_torque_is_on_only_where_the_servo_stands_whatever_is_lost(model, fate):
     assert rig.servo(1).state(rig.clock.t)["position"] == pytest.approx(500, abs=1)
 
 
-# --- position limits --------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("model", MODELS)
 @given(data=st.data())
 def test_a_unit_is_refused_exactly_when_a_goal_of_its_joint_lies_outside_its_limits(model, data):
@@ -91,7 +89,6 @@ def test_a_unit_is_refused_exactly_when_a_goal_of_its_joint_lies_outside_its_lim
         assert each.register not in rig.found()
 
 
-# --- zero and direction -----------------------------------------------------------------------------------------
 MOVES_WRONGLY = [  # model, register, stored, declared (None: nothing), what is wrong
     ("xl330-m288", "homing_offset", 100, 612, "every angle would be -45.0 deg off"),
     ("xl330-m288", "homing_offset", 512, None, "every angle would be +45.0 deg off"),
@@ -140,7 +137,6 @@ def test_the_one_turn_of_an_sts_that_counts_turns_is_shifted_by_its_offset_with_
     assert contradictions(values, table, JointNeeds(1462, 2634, stored={"homing_offset": offset})) == []
 
 
-# --- what acts by itself ----------------------------------------------------------------------------------------
 def test_a_secondary_id_that_is_another_servo_of_the_head_is_refused():
     rig = Rig("xl330-m288", {"id": 1, "registers": {"secondary_id": 2}}, {"id": 2})
     with pytest.raises(ServoError, match="secondary_id is 2, wanted 255: it would follow the goals of id 2 too"):
@@ -158,7 +154,6 @@ def test_a_servo_as_it_leaves_the_factory_contradicts_nothing(model):
     assert rig.found() == {}
 
 
-# --- turns ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("model", WITH_TURNS)
 @pytest.mark.parametrize("found", [4150, -100, 9000])
 def test_a_joint_turned_by_hand_past_one_turn_starts_where_it_stands(model, found):
@@ -192,7 +187,6 @@ def test_an_offset_shifts_the_one_turn_that_there_is():
     assert rig.servo(1).state(rig.clock.t)["position"] == 5000
 
 
-# --- more than one turn -----------------------------------------------------------------------------------------
 GEARED = {"ratio": 4.0, "limit_rad": 1.2}  # 2048 +- 3129 ticks
 
 
@@ -245,7 +239,6 @@ def test_a_trip_of_the_watchdog_that_was_left_over_is_cleared():
     assert rig.held("bus_watchdog") == 0 and rig.held("torque_enable") == 1
 
 
-# --- settings ---------------------------------------------------------------------------------------------------
 def test_a_register_above_those_that_are_polled_is_written_too():
     """XL-320: punch lies behind everything that tells the present."""
     rig = Rig("xl-320", safety=Safety(registers={"punch": 40}))

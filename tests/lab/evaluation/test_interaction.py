@@ -20,7 +20,6 @@ def talk(frames: int = 500, seed: int = 0) -> np.ndarray:
     return np.convolve(np.random.default_rng(seed).random(frames + 4), np.ones(5) / 5, "valid")
 
 
-# --- states ---------------------------------------------------------------------------------------------------------
 def test_confusion_counts_frames_that_have_both_and_adds_up():
     table = scores.confusion(np.array([0, 1, 1, -1], np.int8), np.array([0, 1, 0, 2], np.int8))
     assert table.sum() == 3 and table[0, 0] == table[1, 1] == table[0, 1] == 1
@@ -34,7 +33,6 @@ def test_a_listener_hears_the_user_one_frame_late_and_itself_at_once():
     assert (agent == speaks).mean() > 0.9 and (user[1:] == ~speaks[:-1]).mean() > 0.9 and not user[0]
 
 
-# --- lips -----------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("lag", [-3, 0, 2])
 def test_the_lag_of_a_jaw_is_found(lag):
     values = talk(600)
@@ -58,7 +56,6 @@ def test_a_still_jaw_follows_nothing_short_clips_do_not_count_and_each_is_taken_
     assert found["correlation"] == pytest.approx(1, abs=1e-4)
 
 
-# --- smoothness -----------------------------------------------------------------------------------------------------
 def turning(frames: int = 3000) -> np.ndarray:
     motion = np.zeros((frames, 58))
     motion[:, :3] = np.random.default_rng(0).normal(size=(frames, 3)).cumsum(0)
@@ -80,7 +77,6 @@ def test_a_jaw_that_stays_open_after_speech_is_seen():
     assert scores.listening_again([one.listener, still], [one, silent]) == pytest.approx(0.5, abs=0.05)
 
 
-# --- played ---------------------------------------------------------------------------------------------------------
 def test_the_agents_sound_comes_one_frame_early():
     one = dyad("a", "interaction", 0)
     frames = frames_of_dyad(one)
@@ -91,7 +87,6 @@ def test_the_agents_sound_comes_one_frame_early():
     assert not frames[-1].agent_audio.any()
 
 
-# --- tables ---------------------------------------------------------------------------------------------------------
 def clips(seed: int = 0) -> np.ndarray:
     return 0.01 * np.random.default_rng(seed).normal(size=(3, 250, 58)).cumsum(1)
 
