@@ -37,7 +37,7 @@ from sfms_robot import config
 from sfms_robot.listeners.arig import event_curves
 from sfms_robot.listeners.arig.modules import LongRange, Merge, Progressive, ShortRange, StateUnderstanding
 from sfms_robot.listeners.arig.sampler import CodeHead, Denoiser
-from sfms_robot.listeners.arig.stream import CONTROL_ROWS, FIRST
+from sfms_robot.listeners.arig.stream import CONTROL_ROWS
 from sfms_robot.listeners.audio_frontend import WIDTHS
 from sfms_robot.listeners.layers import ListenerModel, mlp, weighted_mean, windows
 from sfms_robot.signals import phase
@@ -307,20 +307,20 @@ class ArigModel(ListenerModel):
         face = self.embed_face(self.standardise(dyad.user_motion), dyad.user_seen)[:, :-1]
         b, t, d = motion.shape  # below, index t is made from frames 0..t and is for frame t + 1
         c = self.settings.chunk_frames
-        now = agent[:, 1:].reshape(b * t, d)
+        now = agent[:, 1:].flatten(0, 1)
         summaries = self.short(
-            windows(self.merge_agent(agent[:, :-1], motion), c).reshape(b * t, c, d),
-            windows(self.merge_user(user, face), c).reshape(b * t, c, d),
+            windows(self.merge_agent(agent[:, :-1], motion), c).flatten(0, 1),
+            windows(self.merge_user(user, face), c).flatten(0, 1),
             now,
-            user.reshape(b * t, d),
+            user.flatten(0, 1),
         )
-        cis = self.long(summaries.view(b, t, d)).reshape(b * t, d)
+        cis = self.long(summaries.view(b, t, d)).flatten(0, 1)
         voiced = torch.stack([dyad.voiced[:, 1:, 0], dyad.voiced[:, :-1, 1]], dim=-1)
         feature, logits = self._states(cis, voiced, states)
         rows = self.rows(dyad)
         events = None if rows is None else self.embed_events(rows)
         outline = self.progress.coarse(
-            motion.reshape(b * t, d),
+            motion.flatten(0, 1),
             windows(self.progress.coarse.keys(agent), self.settings.sound_frames)[:, 1:].flatten(0, 1),
         )
         z = self.progress.refine(
@@ -346,10 +346,7 @@ class ArigModel(ListenerModel):
         if self.states is None:
             return None, None
         b, t = voiced.shape[:2]
-        keys = self.states.condition(cis, voiced.reshape(b * t, 2))
-        if states is None:
-            first = torch.full((b,), FIRST, device=cis.device)
-            features, logits = self.states.roll(keys.view(b, t, *keys.shape[1:]), first)
-            return features.flatten(0, 1), logits
-        feature, scores = self.states(keys, states[:, :-1].reshape(b * t))
+        keys = self.states.condition(cis, voiced.flatten(0, 1))
+        before = self.states.follow(keys, b) if states is None else states[:, :-1]
+        feature, scores = self.states(keys, before.flatten())
         return feature, scores.view(b, t, -1)

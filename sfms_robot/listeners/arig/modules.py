@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from sfms_robot import config
 from sfms_robot.config.listener import STATES
-from sfms_robot.listeners.arig.stream import QUANTILES, rotary
+from sfms_robot.listeners.arig.stream import FIRST, QUANTILES, rotary
 from sfms_robot.listeners.layers import (
     CrossAttention,
     FeedForward,
@@ -312,18 +312,19 @@ class StateUnderstanding(nn.Module):
         feature = self.norm(self.look(self.previous(previous), keys))  # s_(T-1) is the query, its condition the keys
         return feature, self.classify(feature)
 
-    def roll(self, keys: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-        """Return features (B, T, D) and logits (B, T, S) where every frame continues from the most probable state.
+    @torch.no_grad()
+    def follow(self, keys: Tensor, dyads: int) -> Tensor:
+        """Return the state before each frame, (B, T), where every frame continues from the most probable state.
 
-        `keys`: (B, T, 3, 2D) `condition` of each frame; `first`: (B,) states before them.
+        `keys`: (B * T, 3, 2D) `condition` of the frames of B dyads.
         """
-        features, logits, state = [], [], first
-        for frame in keys.unbind(dim=1):
-            feature, scores = self(frame, state)
-            state = scores.argmax(-1)
-            features.append(feature)
-            logits.append(scores)
-        return torch.stack(features, dim=1), torch.stack(logits, dim=1)
+        # The state after each possible state, of all frames at once; then one frame after the other only looks it up.
+        every = torch.arange(self.classify.out_features, device=keys.device)
+        after = torch.stack([self(keys, state.expand(len(keys)))[1].argmax(-1) for state in every], 1)
+        states = [torch.full((dyads, 1), FIRST, device=keys.device)]
+        for frame in after.view(dyads, -1, len(every)).unbind(1):
+            states.append(frame.gather(1, states[-1]))
+        return torch.cat(states[:-1], 1)
 
 
 # --- Progressive motion prediction (3.4) ------------------------------------------------------------------------------
