@@ -166,7 +166,7 @@ def claims(
                 interval = intervals({"": better}).get("") if enough else None
                 comparable = metric != "SID" or (alike("ARIG", part) and alike(name, part))
                 found.append({
-                    "name": name, "figure": figure, "with all parts better by": round(float(np.mean(better)), 5),
+                    "name": name, "figure": figure, "ARIG better by": round(float(np.mean(better)), 5),
                     "interval": interval,
                     "verdict": verdict(interval, comparable=comparable),
                 })  # fmt: skip
