@@ -19,7 +19,6 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from sfms_robot.app.progress import tracked
 from sfms_robot.config import find, load_training
 from sfms_robot.data import data_dir
 from sfms_robot.errors import ConfigError
@@ -222,12 +221,8 @@ def arig_table(name: str, names: Sequence[str], options: TableOptions, train: bo
         folders[LABELS["arig"]] = [trained("arig", options, models / "arig-as-written")]
     answers = {}
     for label, each in folders.items():
-        rolled = [
-            one.motion[0]
-            for folder in each
-            for one in rollouts(load_listener(folder), tracked(held_out, label), options.seed, CLIP_FRAMES)
-        ]
-        answers[label] = cut(rolled, CLIP_FRAMES)
+        made = [motion for one in each for motion, _ in rollouts(load_listener(one), held_out, options.seed, label)]
+        answers[label] = cut(made, CLIP_FRAMES)
     truth, speaker = (cut([getattr(one, who) for one in held_out], CLIP_FRAMES) for who in ("listener", "speaker"))
     people = people_of(held_out, [len(dyad.listener) for dyad in held_out], CLIP_FRAMES)
     scored, said = rows_of(name, truth, speaker, answers, people)

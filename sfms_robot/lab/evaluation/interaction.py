@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfms_robot import config
-from sfms_robot.app.progress import tracked
 from sfms_robot.config.listener import STATES
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import CHANNEL_INDEX, FRAME_HZ, FRAME_S, NO_SOUND, Bools, Doubles, Floats
@@ -19,7 +18,7 @@ from sfms_robot.lab.corpora.clips import Dyad
 from sfms_robot.lab.corpora.conversational_states import STATE, UNKNOWN
 from sfms_robot.lab.corpora.phrase_timing import near
 from sfms_robot.lab.evaluation.listener_tables import spread_clips
-from sfms_robot.lab.evaluation.rollout import Rollout, rollouts
+from sfms_robot.lab.evaluation.rollout import rollouts
 from sfms_robot.lab.learning.arig.features import open_scenes
 from sfms_robot.listeners import audio_frontend
 from sfms_robot.listeners.registry import load_listener
@@ -41,14 +40,14 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, sp
     if not isinstance(settings, config.Arig):
         raise ConfigError(f"--listener {name}: does not speak; this command evaluates listeners of kind arig")
     held_out = {scene: spread_clips(dyads, clips) for scene, dyads in open_scenes(data, split).items()}
-    rolled = {scene: rollouts(listener, tracked(dyads, f"{name}, {scene}"), seed) for scene, dyads in held_out.items()}
+    rolled = {scene: rollouts(listener, dyads, seed, f"{name}, {scene}") for scene, dyads in held_out.items()}
     every = [one for scene in held_out for one in rolled[scene]]
     dyads = [dyad for each in held_out.values() for dyad in each]
-    motions, people = [one.motion[0] for one in every], [dyad.listener for dyad in dyads]
+    motions, people = [motion for motion, _ in every], [dyad.listener for dyad in dyads]
     lips: Figures = {}
     for scene in ("speaking", "interaction"):  # filmed recordings, and the agent's talk in interaction
         if scene in held_out:
-            made, recorded = [one.motion[0] for one in rolled[scene]], [dyad.listener for dyad in held_out[scene]]
+            made, recorded = [motion for motion, _ in rolled[scene]], [dyad.listener for dyad in held_out[scene]]
             lips |= {f"lips_{scene}_{key}": value for key, value in jaw_tracking(made, recorded).items()}
     return {
         "listener": name,
@@ -56,7 +55,7 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, sp
         "dyads": {scene: len(each) for scene, each in held_out.items()},
         "chunk_border_acceleration_ratio": border_ratio(motions, settings.chunk_frames),
         "dyads_border_acceleration_ratio": border_ratio(people, settings.chunk_frames),
-        **_states(every, dyads, data, clips),
+        **_states([states for _, states in every], dyads, data, clips),
         **lips,
         "jaw_left_a_second_after_speech": listening_again(motions, dyads),
         "people_jaw_left_a_second_after_speech": listening_again(people, dyads),
@@ -66,10 +65,10 @@ def evaluate_interaction(name: str, data: Path, clips: int | None, seed: int, sp
 # --- states ---------------------------------------------------------------------------------------------------------
 
 
-def _states(rolled: Sequence[Rollout], dyads: Sequence[Dyad], data: Path, clips: int | None) -> Figures:
+def _states(rolled: Sequence[States], dyads: Sequence[Dyad], data: Path, clips: int | None) -> Figures:
     """Return accuracies of the listener's states, and of two rules on voices that follow from the training labels."""
     labelled = [
-        (one.states[0], dyad, dyad.states) for one, dyad in zip(rolled, dyads, strict=True) if dyad.states is not None
+        (states, dyad, dyad.states) for states, dyad in zip(rolled, dyads, strict=True) if dyad.states is not None
     ]
     said = np.concatenate([np.zeros(0, np.int8), *(answers for answers, _, _ in labelled)])
     if (said < 0).all():
@@ -119,10 +118,8 @@ def voice_tracks(dyad: Dyad) -> Bools:
 
 def confusion(said: States, states: States) -> NDArray[np.int64]:
     """Count frames by label (rows) and answer (columns), (7, 7); frames without either drop out."""
-    known = (said != UNKNOWN) & (states != UNKNOWN)
-    out = np.zeros((len(STATES), len(STATES)), np.int64)
-    np.add.at(out, (states[known], said[known]), 1)
-    return out
+    counts = np.histogram2d(states, said, np.arange(len(STATES) + 1))[0]  # UNKNOWN is outside of all bins
+    return counts.astype(np.int64)
 
 
 def accuracies(table: NDArray[np.int64]) -> tuple[float, float]:

@@ -262,7 +262,7 @@ def evaluate_listener(
     rows: list[Figures] = []
     for name in names:
         listener = load_at_hop(name, hop)
-        motions = [one.motion[0] for one in rollouts(listener, tracked(dyads, name), seed)]
+        motions = [motion for motion, _ in rollouts(listener, dyads, seed, name)]
         figures = behaviour(motions, dyads)
         if isinstance(listener, SfmsListener):
             settings = listener.settings
@@ -337,7 +337,7 @@ def collect(
         people=people_of(held_out, [len(one.motion) for one in heard], frames),
     )
     answers = {
-        name: cut([_answered(listener, space, dyad, seeds, frames) for dyad in tracked(held_out, name)], frames)
+        name: cut([_answered(listener, space, dyad, seeds) for dyad in tracked(held_out, name)], frames)
         for name, listener in listeners.items()
     }
     for name, listener in listeners.items() if number == 2 else ():
@@ -347,8 +347,8 @@ def collect(
     return clips, answers
 
 
-def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequence[int], frames: int) -> Doubles:
-    """Return the answers (S, N, D) in the space; an end that does not fill a clip may be missing."""
+def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequence[int]) -> Doubles:
+    """Return the answers (S, N, D) in the space."""
     if isinstance(listener, SfmsListener):
         return np.asarray(offline_rollout(listener, dyad, seeds).motion)
     if dyad.space != "arkit58":
@@ -357,5 +357,5 @@ def _answered(listener: Listener, space: MotionSpace, dyad: Dyad, seeds: Sequenc
         raise ConfigError(
             f"dyad {dyad.name}: {dyad.fps:g} frames a second; listeners of other kinds than sfms need {FRAME_HZ}"
         )
-    played = rollout(listener, frames_of_dyad(dyad, frames), seeds)
+    played = rollout(listener, frames_of_dyad(dyad), seeds)
     return np.stack([space.encode(one) for one in played.motion])

@@ -35,7 +35,7 @@ from sfms_robot.lab.corpora.formats import detect, split_names
 from sfms_robot.lab.corpora.phrase_timing import rank_auc
 from sfms_robot.lab.evaluation.detection import middle, movement, nods_of, slow_poses_deg
 from sfms_robot.lab.evaluation.intervals import Chosen, bootstrap, intervals, people_of, rounded
-from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, spread, streamable
+from sfms_robot.lab.evaluation.rollout import frames_of_dyad, load_at_hop, rollout, rollouts, spread, streamable
 from sfms_robot.listeners.engine import EngineName
 from sfms_robot.listeners.registry import engine_name, one_thread
 
@@ -78,11 +78,9 @@ def evaluate_naturalness(
     if len(dyads) < 2 * FOLDS:
         raise ConfigError(f"{data}: {len(dyads)} dyads of {split}; this comparison needs {2 * FOLDS} or more")
     listener = load_at_hop(name, engine=engine)
-    heard = [frames_of_dyad(dyad) for dyad in dyads]
-    listened = enumerate(tracked(heard, f"{name} listens"))
-    ours = [rollout(listener, speaker, [seed + number]).motion[0] for number, speaker in listened]
+    ours = [motion for motion, _ in rollouts(listener, dyads, seed, f"{name} listens")]
     # The input of one stream is one person after another.
-    frames = islice(cycle(chain.from_iterable(heard)), round(drift_s * FRAME_HZ))
+    frames = islice(cycle(chain.from_iterable(map(frames_of_dyad, dyads))), round(drift_s * FRAME_HZ))
     timed = [changed(frame, time_s=number * FRAME_S) for number, frame in enumerate(frames, start=1)]
     long = rollout(listener, timed, [seed], title="a long run").motion[0]
     theirs, training = [dyad.listener for dyad in dyads], list[Floats]()

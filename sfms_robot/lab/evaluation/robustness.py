@@ -12,6 +12,7 @@ decisions for them are counted.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -199,7 +200,7 @@ class InputCondition:
     """One way in which a microphone or a camera is not ideal.
 
     Attributes:
-        voice, face: Functions that change the samples and the motion.
+        voice, face: Functions that change the samples, which are clipped afterwards, and the motion.
         attention: Number of frames -> (frames,); if None, the speaker looks at the head all the time.
         mouth_moves: The face still shows speech.
     """
@@ -217,31 +218,31 @@ def noise(voice: Floats, rng: Rng) -> Floats:
     spectrum /= np.sqrt(np.maximum(np.arange(len(spectrum)), 1))
     pink = np.fft.irfft(spectrum, len(voice))
     level = _rms(voice) * 10 ** (_NOISE_DB / 20) / _rms(pink)
-    return _clipped(voice + level * pink)
+    return voice + (level * pink).astype(np.float32)
 
 
 def quiet(voice: Floats, rng: Rng) -> Floats:
     """Attenuate by 20 dB, as from across a room."""
-    return _clipped(voice * 0.1)
+    return voice * 0.1
 
 
 def loud(voice: Floats, rng: Rng) -> Floats:
-    """Amplify by 12 dB and clip."""
-    return _clipped(voice * 4.0)
+    """Amplify by 12 dB, beyond what a microphone can give."""
+    return voice * 4.0
 
 
 def room(voice: Floats, rng: Rng) -> Floats:
     """Add as much sound from the walls as from the mouth, decaying by 60 dB in 0.6 s."""
     samples = round(_RT60_S * AUDIO_HZ)
     tail = rng.standard_normal(samples) * 10 ** (-3 * np.arange(samples) / samples)
-    walls = oaconvolve(voice, tail / np.sqrt(np.sum(tail**2)))[: len(voice)]
-    return _clipped((voice + walls) / np.sqrt(2))
+    walls: Floats = oaconvolve(voice, tail / np.sqrt(np.sum(tail**2)))[: len(voice)].astype(np.float32)
+    return (voice + walls) * math.sqrt(0.5)
 
 
 def telephone(voice: Floats, rng: Rng) -> Floats:
     """Resample through 8 kHz."""
     narrow = soxr.resample(soxr.resample(voice, AUDIO_HZ, AUDIO_HZ // 2), AUDIO_HZ // 2, AUDIO_HZ)
-    return _clipped(np.pad(narrow, (0, max(0, len(voice) - len(narrow))))[: len(voice)])
+    return np.pad(narrow, (0, max(0, len(voice) - len(narrow))))[: len(voice)]
 
 
 def jitter(face: Floats, rng: Rng) -> Floats:
@@ -283,10 +284,6 @@ def _rms(values: NDArray[np.floating]) -> float:
     return float(np.sqrt(np.mean(np.asarray(values, np.float64) ** 2))) + 1e-12
 
 
-def _clipped(values: NDArray[np.floating]) -> Floats:
-    return np.asarray(np.clip(values, -1, 1), np.float32)
-
-
 CONDITIONS: Final = (
     InputCondition(name="as recorded"),
     *(InputCondition(name=each.__name__, voice=each) for each in (noise, quiet, loud, room, telephone)),
@@ -316,7 +313,8 @@ def heard_and_seen(
     """Return `minutes` of the speaker, repeated from the beginning if the recording is shorter."""
     frames = round(60 * minutes * FRAME_HZ)
     voice = np.resize(speaker.voice, frames * FRAME_SAMPLES).astype(np.float32)
-    voice = condition.voice(voice, rng) if condition.voice else voice
+    if condition.voice:
+        voice = np.clip(condition.voice(voice, rng), -1, 1).astype(np.float32)
     face = np.full((frames, len(CHANNEL_INDEX)), np.nan, np.float32)
     if inputs != "voice":
         face = np.resize(speaker.face, face.shape).astype(np.float32)

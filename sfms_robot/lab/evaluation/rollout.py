@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,7 +45,6 @@ from sfms_robot.lab.learning.sfms.features import frames_of, keyframe_tokens, pl
 from sfms_robot.listeners.arig.stream import ArigMemory
 from sfms_robot.listeners.capacity import step_each
 from sfms_robot.listeners.engine import EngineName
-from sfms_robot.listeners.eventful import EventfulMemory
 from sfms_robot.listeners.events.model import LEAD_FRAMES
 from sfms_robot.listeners.registry import at_hop, hops_of, load_listener, one_thread
 from sfms_robot.listeners.sfms.draw import UNDECIDED, Context, later, passed, revoked
@@ -132,10 +131,9 @@ def speaker_frames(
     return frames
 
 
-def frames_of_dyad(dyad: Dyad, clip_frames: int = 1) -> list[SpeakerFrame]:
-    """Return both tracks of a dyad as a source does, without the end that does not fill a clip of `clip_frames`."""
-    whole = len(dyad.speaker) // clip_frames * clip_frames
-    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio, dyad.attention)[:whole]
+def frames_of_dyad(dyad: Dyad) -> list[SpeakerFrame]:
+    """Return both tracks of a dyad as a source does."""
+    return speaker_frames(dyad.audio, dyad.speaker, dyad.agent_audio, dyad.attention)
 
 
 # --- frame by frame -------------------------------------------------------------------------------------------------
@@ -177,35 +175,48 @@ def rollout(
 
     `events`: Events for a listener that follows events. `title`: Title of a progress bar; "": no bar.
     """
-    memories: Sequence[Any] = [listener.start(seed) for seed in seeds]
-    motion = np.zeros((len(seeds), len(speaker) + listener.horizon, MOTION_DIM), np.float32)
-    states = np.full((len(seeds), len(speaker) + 1), UNKNOWN, np.int8)
+    return _together(listener, [speaker] * len(seeds), seeds, [events] * len(seeds), title)
+
+
+def rollouts(listener: Listener, dyads: Sequence[Dyad], seed: int, title: str) -> list[tuple[Floats, NDArray[np.int8]]]:
+    """Play one stream through every dyad from its beginning, with seeds from `seed` on, all together if it can.
+
+    Returns motion (N, 58) and states (N,) of each, as in `Rollout`. A listener that follows events receives those of
+    the dyad's listener. `title`: Title of a progress bar.
+    """
+    speakers, seeds = [*map(frames_of_dyad, dyads)], range(seed, seed + len(dyads))
+    played = _together(listener, speakers, seeds, [dyad.events or () for dyad in dyads], title)
+    streams = zip(played.motion, played.states, map(len, speakers), strict=True)
+    return [(motion[:frames], states[:frames]) for motion, states, frames in streams]
+
+
+def _together(
+    listener: Listener,
+    speakers: Sequence[Sequence[SpeakerFrame]],
+    seeds: Sequence[int],
+    events: Sequence[Sequence[ListenerEvent]],
+    title: str,
+) -> Rollout:
+    """Play one stream for each speaker, as long as the longest; a stream ends with its speaker."""
+    memories: list[Any] = [listener.start(seed) for seed in seeds]
+    longest = max(map(len, speakers))
+    motion = np.zeros((len(seeds), longest + listener.horizon, MOTION_DIM), np.float32)
+    states = np.full((len(seeds), longest + 1), UNKNOWN, np.int8)
     decided: list[list[ListenerEvent]] = [[] for _ in seeds]
-    for index, frame in enumerate(tracked(speaker, title) if title else speaker):
-        control = control_at(listener, events, index)
-        controls = () if control is None else ([control] * len(seeds),)
-        stepped = step_each(listener, [frame] * len(seeds), memories, *controls)
-        memories = [memory for _, memory in stepped]
-        for row, (plan, _) in enumerate(stepped):
+    for index in tracked(range(longest), title) if title else range(longest):
+        rows = [row for row, speaker in enumerate(speakers) if index < len(speaker)]
+        controls = [control_at(listener, events[row], index) for row in rows]
+        frames, before = [speakers[row][index] for row in rows], [memories[row] for row in rows]
+        stepped = step_each(listener, frames, before, *[controls] * (controls[0] is not None))
+        for row, (plan, memory) in zip(rows, stepped, strict=True):
+            memories[row] = memory
             if plan is not None:
-                motion[row, index + 1 : index + 1 + listener.horizon] = plan.frames
+                motion[row, index + 1 :][: listener.horizon] = plan.frames
                 decided[row] += plan.events
-        for row, memory in enumerate(memories):
-            how = memory.how if isinstance(memory, EventfulMemory) else memory
+            how = getattr(memory, "how", memory)
             if isinstance(how, ArigMemory):
                 states[row, index + 1] = paper_state(how.state)
-    return Rollout(motion[:, : len(speaker)], states[:, : len(speaker)], tuple(map(tuple, decided)))
-
-
-def rollouts(listener: Listener, dyads: Iterable[Dyad], seed: int, clip_frames: int = 1) -> list[Rollout]:
-    """Play one stream through every dyad from its beginning, with seeds from `seed` on.
-
-    A listener that follows events receives those of the dyad's listener. `clip_frames`: see `frames_of_dyad`.
-    """
-    return [
-        rollout(listener, frames_of_dyad(dyad, clip_frames), [seed + number], dyad.events or ())
-        for number, dyad in enumerate(dyads)
-    ]
+    return Rollout(motion[:, :longest], states[:, :longest], tuple(map(tuple, decided)))
 
 
 # --- from arrays ----------------------------------------------------------------------------------------------------

@@ -17,7 +17,6 @@ from typing import Any, Final
 import numpy as np
 from scipy.optimize import nnls
 
-from sfms_robot.app.progress import tracked
 from sfms_robot.config import find
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import BLENDSHAPES, FRAME_HZ, FRAME_SAMPLES, SHAPES, Doubles, Floats, ListenerEvent
@@ -168,10 +167,10 @@ def train_idle(name: str, data: Path, clips: int, seed: int) -> dict[str, Any]:
             f"{data}: expected dyads with events of listeners; without blinks and smiles rest cannot be found"
         )
     how = load_folder(folder)
-    shown = rollouts(how, tracked(chosen, f"{name} listens"), seed)
+    shown = rollouts(how, chosen, seed, f"{name} listens")
     theirs, ours = (
         [resting(motion, dyad.events or (), dyad.agent_audio) for motion, dyad in zip(motions, chosen, strict=True)]
-        for motions in ([dyad.listener for dyad in chosen], [one.motion[0] for one in shown])
+        for motions in ([dyad.listener for dyad in chosen], [motion for motion, _ in shown])
     )
     try:
         idle = fit_idle(theirs, ours)

@@ -152,8 +152,7 @@ def make_step(gradients: Gradients, step: int, generator: Generator) -> Tensor:
     Raises ModelError, on a CPU and before updating anything, if loss or norm is not finite; GroupError.
     """
     job = gradients.job
-    for one in job.optimizers:
-        one.zero_grad(set_to_none=True)
+    job.model.zero_grad()
     with gradients.talking(step):
         loss = gradients.of(step, generator)
     norms = [_clip(one, job.phase.clip_norm) for one in job.optimizers]
@@ -184,8 +183,7 @@ def _enough_memory(
         yield
     except torch.OutOfMemoryError as error:
         job, file = gradients.job, gradients.file
-        for one in job.optimizers:
-            one.zero_grad(set_to_none=True)
+        job.model.zero_grad()
         for values in made:
             position = _moved(position, values.tolist()[0])
         step = position.step

@@ -113,11 +113,12 @@ def test_a_plan_from_the_true_past_begins_where_the_truth_is():
     assert near < 0.7 * far
 
 
-def test_what_is_no_whole_clip_is_not_played():
-    one, model = dyad("a", 45), listener()
-    assert [len(frames_of_dyad(one, frames)) for frames in (1, 10, 45, 50)] == [45, 40, 45, 0]
-    whole, clips = (rollouts(model, [one], 3, clip_frames=frames)[0].motion for frames in (1, 10))
-    np.testing.assert_array_equal(clips, whole[:, :40])
+def test_dyads_of_any_lengths_are_played_together_as_each_alone():
+    dyads, model = [dyad("a", 45), dyad("b", 60), dyad("c", 20)], listener()
+    for number, (motion, states) in enumerate(rollouts(model, dyads, 3, "played")):
+        alone = rollout(model, frames_of_dyad(dyads[number]), [3 + number])
+        np.testing.assert_allclose(motion, alone.motion[0], atol=1e-5)
+        np.testing.assert_array_equal(states, alone.states[0])
 
 
 def test_clips_are_cut_one_behind_the_other():

@@ -200,9 +200,8 @@ def test_both_phases_learn_to_nod_when_they_are_told(tmp_path):
     predictor_trainer.train_listener(chosen, tmp_path / "data", tmp_path / "out")
     calibrate(chosen, tmp_path / "data", tmp_path / "out")
     unseen, listener = dyad("c", seed=2), load_folder(tmp_path / "out")
-    (told,) = rollouts(listener, [unseen], seed=1)
-    (quiet,) = rollouts(listener, [replace(unseen, events=())], seed=1)
+    told, quiet = (rollouts(listener, [each], 1, "played")[0][0] for each in (unseen, replace(unseen, events=())))
     people = unseen.listener[:, 1]
-    agrees = [float(np.corrcoef(people, one.motion[0, :, 1])[0, 1]) for one in (told, quiet)]
+    agrees = [float(np.corrcoef(people, motion[:, 1])[0, 1]) for motion in (told, quiet)]
     assert agrees[0] > 0.3 > agrees[1]
-    assert not told.motion[0][:, GAZE].any()
+    assert not told[:, GAZE].any()

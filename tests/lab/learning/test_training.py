@@ -80,9 +80,9 @@ def test_both_phases_train_into_a_listener_that_streams(data, tmp_path, placemen
     assert (first["steps"], second["steps"]) == (12, 8)
     calibrate(chosen, data, tmp_path)
     unseen = dyad("c", 160, seed=2)
-    (one,) = rollouts(load_folder(tmp_path), [unseen], seed=1)
-    assert one.motion.shape == (1, 160, 58) and np.isfinite(one.motion).all()
-    own, people = behaviour([one.motion[0]], [unseen]), behaviour([unseen.listener], [unseen])
+    ((motion, _),) = rollouts(load_folder(tmp_path), [unseen], 1, "played")
+    assert motion.shape == (160, 58) and np.isfinite(motion).all()
+    own, people = behaviour([motion], [unseen]), behaviour([unseen.listener], [unseen])
     assert people["blinks"] >= 0 and own["jerk_deg_s3"] > 0
 
 
