@@ -1,4 +1,4 @@
-"""wav2vec2 features of each 40 ms frame, from a model folder on disk; one code path offline and streaming.
+"""wav2vec2 features of each 40 ms frame of a stream, from a model folder on disk; the same however it is cut.
 
 The transformer processes a whole recording at once, including the future. A listener receives a stream, so each frame
 has a separate window: the last 50 frames (2 s) and 80 samples, so that the last two latents end with the frame; their
@@ -21,7 +21,7 @@ import numpy as np
 import torch
 
 from sfms_robot.errors import ModelError, first_line, optional
-from sfms_robot.frames import AUDIO_HZ, FRAME_HZ, FRAME_SAMPLES, Floats, Indices
+from sfms_robot.frames import FRAME_SAMPLES, Floats
 
 CONTEXT_FRAMES: Final = 50
 STRIDE: Final = 320  # samples from one latent to the next
@@ -79,29 +79,15 @@ class Wav2Vec2:
         hops = max(0, (len(seen) - self._window) // self._hop + 1)
         if not hops:
             return np.zeros((0, self.dim), np.float32), seen
-        return self._rows(seen, self._hop * np.arange(hops)), seen[hops * self._hop :].copy()
-
-    def of_recording(self, samples: Floats, fps: float = FRAME_HZ) -> Floats:
-        """Return the rows (frames, dim) of a whole recording.
-
-        At 25 fps they equal those of a stream; an incomplete last hop is filled up with silence. At other rates each
-        window ends with its frame, which needs a hop of one frame: raises ValueError for other hops.
-        """
-        if fps != FRAME_HZ and self.hop_frames != 1:
-            raise ValueError(f"a hop of {self.hop_frames} frames needs data at {FRAME_HZ} fps, not {fps:g}")
-        frames = int(len(samples) * fps / AUDIO_HZ + 1e-6)
-        hops = -(-frames // self.hop_frames)
-        ends = np.round(np.arange(1, hops + 1) * self.hop_frames * AUDIO_HZ / fps).astype(int)
-        seen = np.concatenate([np.zeros(self._window), samples, np.zeros(self._hop)]).astype(np.float32)
-        return self._rows(seen, ends)[:frames]
+        return self._rows(seen), seen[hops * self._hop :].copy()
 
     @torch.no_grad()
-    def _rows(self, samples: Floats, begins: Indices) -> Floats:
-        """Return the rows (hops * hop_frames, dim) of the windows of `samples` (n,) that begin at `begins` (hops,)."""
-        windows = np.lib.stride_tricks.sliding_window_view(samples, self._window)
+    def _rows(self, samples: Floats) -> Floats:
+        """Return the rows (hops * hop_frames, dim) of all hops that are whole in `samples` (n,), the past first."""
+        windows = np.lib.stride_tricks.sliding_window_view(samples, self._window)[:: self._hop]
         rows = [np.zeros((0, self.dim), np.float32)]
-        for at in range(0, len(begins), BATCH):
-            sound = torch.from_numpy(windows[begins[at : at + BATCH]]).to(self._device)
+        for at in range(0, len(windows), BATCH):
+            sound = torch.from_numpy(windows[at : at + BATCH].copy()).to(self._device)
             if self._normalise:
                 mean = sound.mean(dim=1, keepdim=True)
                 sound = (sound - mean) / (sound.var(dim=1, correction=0, keepdim=True) + 1e-7).sqrt()

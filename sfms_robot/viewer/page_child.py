@@ -106,5 +106,6 @@ async def _serve(address: Address, parent: ParentPipe, scene_of: SceneOf) -> Non
         writer.send(pickle.dumps(None))  # a sign of life
         with suppress(TimeoutError):
             await asyncio.wait_for(over.wait(), BEAT_S)
+    await page.replayed()
     server.should_exit = True
     await serving

@@ -50,6 +50,8 @@ PERSON_S: Final = 0.001  # time allotted to a piece of sound, or a face
 PERSON_BYTES_PER_S: Final = 4e6
 BURST_S: Final = 0.25
 FREE: Final = ("hello", "ping", "take", "give")  # commands that need no controls
+REPLAY_S: Final = 5.0  # time after the end of a run in which visitors may fetch /runs/last
+_LOOK_S: Final = 0.05
 _LINES_AT_ONCE: Final = 10  # for a platform each line takes 1.5 ms
 
 NewScene = Callable[[], RobotScene | None]
@@ -225,6 +227,7 @@ class PageServer:
         self._record: Facts | None = None
         self._recording: Path | None = None
         self._over: Facts | None = None  # report of a run that is over
+        self._fetched = 0  # how often that run was fetched
         self._history = deque[tuple[bool, bytes]](maxlen=KEPT_FRAMES)  # (packed picture or not, message)
         self._files, self._human = CompressedFiles(), CompressedFiles(HUMAN)
         self.app = application(
@@ -282,8 +285,15 @@ class PageServer:
 
     def end(self, report: Facts) -> None:
         """Send the report of the run, which is over, to all visitors."""
-        self._over = report
+        self._over, self._fetched = report, 0
         self.tell(message_json(type="over", report=report))
+
+    async def replayed(self) -> None:
+        """Wait until all visitors of a run that is over have fetched it, which their pages do; `REPLAY_S` at most."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(REPLAY_S):
+                while self._over is not None and self._fetched < len(self._visitors):
+                    await asyncio.sleep(_LOOK_S)
 
     def answer(self, number: int, message: bytes) -> None:
         """Send a message to one visitor, if it is still connected."""
@@ -316,6 +326,7 @@ class PageServer:
             part = kept[first : first + _LINES_AT_ONCE]
             yield b"".join((frame_json(each, shown) if packed else each) + b"\n" for packed, each in part)
             await asyncio.sleep(0)
+        self._fetched += 1
 
     async def _download(self, request: Request) -> Response:
         if not token_admits(request.query_params.get("token", ""), self._token):

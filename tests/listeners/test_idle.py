@@ -102,7 +102,6 @@ def test_the_heads_of_shipped_listeners_sway_as_far_as_people_do(name: str):
     assert (np.array(alive) > 0.2 * (high - low) / 4.65).all()
 
 
-# --- Idle motion of a face --------------------------------------------------------------------------------------------
 BROW = BLENDSHAPES.index("browInnerUp")
 
 
@@ -205,7 +204,6 @@ def test_a_listener_adds_it_to_every_plan_whatever_the_hop_and_tells_it_of_its_o
         np.testing.assert_allclose(moving.frames, expected, atol=1e-6)
 
 
-# --- Laws of both -----------------------------------------------------------------------------------------------------
 def of_sway(seed, times_s, spread=0.0):
     return sway_at(made_sway(seed, spread=spread), times_s).astype(np.float64)
 

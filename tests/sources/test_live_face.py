@@ -21,7 +21,6 @@ HZ = 10
 FIRST, SECOND = ("192.0.2.1", 1), ("192.0.2.2", 2)
 
 
-# --- the flag -----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("face", "kind", "place", "flips"),
     [
@@ -74,7 +73,6 @@ def test_a_port_that_is_none_is_one_line(place):
         live.parse_endpoint("live-link", place)
 
 
-# --- the person's rest --------------------------------------------------------------------------------------------
 def motion(pose=(0, 0, 0), **shapes):
     out = np.zeros(MOTION_DIM, np.float32)
     out[:3] = pose
@@ -167,7 +165,6 @@ def test_the_strongest_blink_since_the_last_question_is_seen():
     assert face.at(1.0).face.time_s == pytest.approx(3 / 60)
 
 
-# --- packets ------------------------------------------------------------------------------------------------------
 class Bytes(live.Decoder):
     """A protocol of one byte: the first pose channel in percent; 255 is none of it."""
 

@@ -37,7 +37,6 @@ def packet(number=100, values=(0.25,) * 61, version=6, device=b"id", subject=b"p
     return bytes([version]) + names + frame + struct.pack(f">B{len(values)}f", len(values), *values)
 
 
-# --- one packet -------------------------------------------------------------------------------------------------
 def test_every_recorded_packet_says_what_another_program_read_in_it_and_is_motion_by_name():
     rows = decoded()
     assert len(rows) == len(PACKETS) == 180
@@ -138,7 +137,6 @@ def test_any_bytes_are_refused_or_finite(data):
     assert values is None or (np.isfinite(values).all() and np.isfinite(motion_of(values)).all())
 
 
-# --- their order ------------------------------------------------------------------------------------------------
 def decode(numbers, decoder=None, start_s=0.0, step_s=1 / 60):
     """Which of these frame numbers become faces, and what is counted."""
     decoder = decoder or LiveLinkDecoder()
@@ -188,7 +186,6 @@ def test_a_program_that_does_not_count_is_seen_and_a_packet_without_a_face_shows
     assert (counted["doubled"], counted["lost"], counted["no_face"]) == (0, 0, 1)
 
 
-# --- over a socket ----------------------------------------------------------------------------------------------
 @pytest.fixture
 def sight():
     opened = open_live_link("127.0.0.1:" + str(free_udp_port()))

@@ -13,7 +13,6 @@ from sfms_robot.sources import paired
 from sfms_robot.sources.live_voice import SourcePart
 from sfms_robot.sources.paired import ALLOWANCE_S, FACE_S, LONGEST_WAIT_S, FrameJudge, JudgedSource, PairedSource
 
-# --- what is handed over ---
 anything = st.floats(width=32) | st.just(float("nan"))
 samples = hnp.arrays(np.float32, st.sampled_from([0, 1, 639, FRAME_SAMPLES, 641, (2, 640)]), elements=anything)
 vectors = st.sampled_from([0, 3, 6, 52]).flatmap(lambda n: hnp.arrays(np.float32, n, elements=anything))
@@ -97,7 +96,6 @@ def test_an_object_that_is_no_source_is_told_what_it_lacks():
         JudgedSource(hum)
 
 
-# --- the grid ---
 class Scripted(SourcePart):
     """A voice whose frame i is at hand `late_s[i]` after its end, and a sight whose faces come at `seen_s`."""
 

@@ -24,7 +24,6 @@ ORIGIN_S = 1000.0
 TONE_HZ = 40.0  # of which an instant can be told to a few milliseconds
 
 
-# --- the device --------------------------------------------------------------------------------------------------
 def tone(samples):
     return np.sin(2 * np.pi * TONE_HZ / AUDIO_HZ * np.asarray(samples)).astype(np.float32)
 
@@ -159,7 +158,6 @@ def test_in_silence_it_is_put_right_at_once():
     assert not device.playout.silences and device.playout.statistics()["jumps"] == 0
 
 
-# --- the voice ---------------------------------------------------------------------------------------------------
 class VirtualLoudspeaker:
     """`playback.Loudspeaker` on a sound card of 16 kHz, in virtual time.
 

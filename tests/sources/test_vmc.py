@@ -55,7 +55,6 @@ def shown(*messages, decoder=None):
     return (decoder or VmcDecoder()).decode(bundle(*messages), 0.0)
 
 
-# --- names ------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     "written", [str, str.upper, str.lower, lambda name: "BlendShape." + name.replace("Left", "_L")]
 )
@@ -98,7 +97,6 @@ def test_presets_count_until_an_arkit_shape_moves_and_with_apply_bundles_of_one_
     assert shown(APPLY, decoder=decoder)[CHANNEL_INDEX["jawOpen"]] == 0.75
 
 
-# --- faces that nothing completes -------------------------------------------------------------------------------
 def faces_of(rounds, pack, decoder=None):
     """The jaw of each face that comes out of rounds of blendshapes a 30th of a second apart, and what is due then."""
     decoder, jaws = decoder or VmcDecoder(), []
@@ -128,7 +126,6 @@ def test_what_a_sender_lacks_and_names_that_say_nothing_are_told():
     assert decoder.remark() == "4 of 52 channels used; not known: Ahoge, Tail"
 
 
-# --- bones ------------------------------------------------------------------------------------------------------
 @given(st.integers(0, 2**32 - 1))
 def test_any_rotation_turns_our_axes_as_it_turns_unitys(seed):
     """R_ours = A R A^T, A a reflection: it takes left-handed axes to right-handed ones."""
@@ -152,7 +149,6 @@ def test_lost_tracking_shows_nothing_until_it_is_back():
     assert shown(message("/VMC/Ext/OK", 1), APPLY, decoder=decoder) is not None
 
 
-# --- other types, and what is none ------------------------------------------------------------------------------
 @pytest.mark.parametrize("value", [1, (0.25, "d"), (1, "h")])
 def test_numbers_of_other_types_are_read(value):
     turn = [(part, "d") for part in (*LEVEL, 0.0, math.sin(0.15), 0.0, math.cos(0.15))]
@@ -239,7 +235,6 @@ def test_any_bytes_are_refused_or_finite(data):
     assert motion is None or np.isfinite(motion).all()
 
 
-# --- over a socket ----------------------------------------------------------------------------------------------
 @pytest.fixture
 def sight():
     opened = open_vmc(str(free_udp_port()))

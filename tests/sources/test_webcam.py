@@ -123,7 +123,6 @@ def test_a_covered_lens_shows_no_face():
     landmarker.close()
 
 
-# --- a face in our axes -----------------------------------------------------------------------------------------
 def matrix_of(roll, pitch, yaw, right_up_near_cm=(0.0, 0.0, -60.0)):
     """Face -> camera as MediaPipe gives it: our rotation, with x = left, y = up, z = forward."""
     theirs, matrix = [1, 2, 0], np.eye(4)  # their axes, among ours
@@ -159,7 +158,6 @@ def test_blendshapes_go_by_name_and_the_tongue_is_not_seen():
     assert seen.motion[CHANNEL_INDEX["tongueOut"]] == 0.0
 
 
-# --- the person among several faces -----------------------------------------------------------------------------
 STEP_S = 1 / 30
 LEFT, RIGHT = np.array([0.6, 0.3, 0.0]), np.array([0.6, -0.3, 0.0])
 
@@ -212,7 +210,6 @@ def test_the_order_of_the_faces_does_not_matter(order):
     assert followed([[faces[k] for k in order]])[0] is faces[1]
 
 
-# --- closed loop: the virtual human before the camera ---------------------------------------------------------------
 @pytest.mark.slow
 def test_channels_come_back_with_their_signs_and_on_their_side():
     turns, moves = ("roll", "pitch", "yaw"), ("x", "y", "z")

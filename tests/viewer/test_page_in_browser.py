@@ -1,5 +1,6 @@
 """The page in a real browser, on a run of the emulated head."""
 
+import signal
 import socket
 
 import numpy as np
@@ -380,9 +381,12 @@ def test_torque_that_the_end_of_a_run_could_not_confirm_off_is_named(own_page, r
 
 
 def test_a_run_that_has_ended_stays_as_its_replay(tmp_path):
-    with ServedRun("run", "--port", "sim", "--head", "op3_head", "--duration", "5", "--seed", "1") as run:
+    with ServedRun("run", "--port", "sim", "--head", "op3_head", "--seed", "1") as run:
         with Page(tmp_path, size=WINDOW) as page:
             page.open(run.url)
+            slowly = "(...what) => new Promise((go) => setTimeout(go, 2000)).then(() => quick(...what))"
+            page.driver.execute_script(f"const quick = fetch; globalThis.fetch = {slowly}")
+            run.process.send_signal(signal.SIGINT)
             page.until("page.ended && page.replay")
             run.process.wait()
             page.until("!page.connection.open")

@@ -6,7 +6,8 @@ import json
 import pytest
 
 from sfms_robot.errors import PacketError
-from sfms_robot.viewer.page_server import IDLE_S, MOST_VISITORS, OUTBOX, Visitors
+from sfms_robot.viewer import page_server
+from sfms_robot.viewer.page_server import IDLE_S, MOST_VISITORS, OUTBOX, PageServer, Visitors
 
 
 class Here:
@@ -93,3 +94,22 @@ def test_of_pictures_the_newest_is_sent_who_reads_nothing_is_found_out_and_a_flo
     visitor = Here().visitors.enter()
     pauses = [visitor.pause_s(0.01, 100.0) for _ in range(100)]
     assert pauses[:24] == [0.0] * 24 and pauses[-1] == pytest.approx(0.75)
+
+
+def test_a_run_that_is_over_is_served_until_each_visitor_has_its_replay(monkeypatch):
+    monkeypatch.setattr(page_server, "REPLAY_S", None)  # no limit
+
+    async def served():
+        page = PageServer(lambda *_: None, None)
+        page.begin({}, lambda: None)
+        await page.replayed()  # a run that goes on has none
+        page._visitors.enter(), page._visitors.enter()
+        page.end({})
+        waiting = asyncio.create_task(page.replayed())
+        for _ in range(2):
+            await asyncio.sleep(0)
+            assert not waiting.done()
+            assert [line async for line in page._lines()]
+        await waiting
+
+    asyncio.run(served())

@@ -140,7 +140,6 @@ def test_every_unit_with_a_shape_moves_it_and_nothing_else():
     assert blendshapes_of(np.full((1, 24), 9.0)).max() == 1.0 and blendshapes_of(np.full((1, 24), -1.0)).min() == 0.0
 
 
-# --- which way numbers point ------------------------------------------------------------------------------------
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_key_points_tell_which_way_heads_turn(mirrored, tmp_path):
     write.seamless(tmp_path, 2)
@@ -164,7 +163,6 @@ def test_without_key_points_signs_are_unverified_and_archives_still_packed_are_n
     assert "0044.tar" in str(scanned(tmp_path).problems[0]) and "unpack" in str(scanned(tmp_path).problems[0])
 
 
-# --- what is there, and what is not -----------------------------------------------------------------------------
 def test_newer_movement_replaces_the_older(tmp_path):
     write.seamless(tmp_path, 1)
     newer = {f"movement_v4:{key.split(':')[1]}": rows_of(tmp_path, ONE, key) for key in (ROTATION, UNITS, VALID)}
@@ -200,7 +198,6 @@ def test_training_on_them_names_the_licence_and_unconverted_the_way(tmp_path, ca
         open_for("arkit58", tmp_path, "train")
 
 
-# --- bad input --------------------------------------------------------------------------------------------------
 def vad(change):
     def harm(root):
         file = file_of(root, ONE, ".json")
