@@ -42,7 +42,6 @@ def groups(one: Any) -> list[Any]:
     return list(one.listener.groups.values())
 
 
-# --- SFMS -----------------------------------------------------------------------------------------------------------
 SFMS = {
     "III-B: 52 expressions and 6 of pose": {"listener.motion_space": "faceverse58"},
     "IV-B2, Algorithm 1, (4) to (7): keyframes by Gumbel top-k scores": {"listener.placement": "learned_paper"},
@@ -77,7 +76,6 @@ def test_the_configuration_does_what_the_sfms_paper_says(said, name):
     assert holds(trained(name), SFMS[said])
 
 
-# --- ARIG -----------------------------------------------------------------------------------------------------------
 ARIG = {
     "(1): told of sounds and motions": off("listener", "events phase"),
     "3.2: both modalities": {"listener.visual": True},
@@ -110,7 +108,6 @@ def test_the_configuration_does_what_the_arig_paper_says(said, name):
     assert holds(trained(name), ARIG[said])
 
 
-# --- the papers' sizes ----------------------------------------------------------------------------------------------
 WIDTHS = {
     "sfms": {"tokenizer_width": 256, "predictor_width": 256},  # V-B
     "arig": {"width": 512, "feedforward": 2048, "context_chunks": 512},  # A.2, 4.1
@@ -137,7 +134,6 @@ def test_both_papers_optimizer_is_theirs():
     assert schedule(phase.steps // 2, phase) == pytest.approx(0.5, abs=0.03)
 
 
-# --- what the shipped listeners do besides --------------------------------------------------------------------------
 PAIRS = {"sfms-small": ("sfms-small", "sfms-as-written"), "arig-small": ("arig", "arig-as-written")}
 
 

@@ -95,7 +95,6 @@ def test_every_command_without_hardware_succeeds(line, folder):
     assert done.returncode == 0, done.stderr
 
 
-# --- troubleshooting --------------------------------------------------------------------------------------------------
 def literal(node):
     """Return the text of a string expression, with ... for what is filled in; "" where it is not literal."""
     if isinstance(node, ast.Constant):
@@ -131,7 +130,6 @@ def test_every_warning_and_error_is_explained():
     assert {text: place for text, place in messages().items() if text not in page} == {}
 
 
-# --- one source for speeds --------------------------------------------------------------------------------------------
 SPEED = r"\d[\d.,]* (?:ms|us|ticks/s|ticks a second|plans a second|of a core|MB resident)\b"
 
 

@@ -122,7 +122,6 @@ def answered(output, frame, now_s=0.0, opens=False, step_s=0.0):
     return str(caught.value)
 
 
-# --- Encoding ---------------------------------------------------------------------------------------------------------
 def test_antennas_and_body_move_as_those_of_the_shipped_head():
     retargeter, rng = HeadRetargeter(load_head("reachy_mini")), np.random.default_rng(0)
     for _ in range(50):
@@ -169,7 +168,6 @@ def test_vtube_studio_gets_degrees_and_shares_that_are_0_for_a_neutral_face_in_t
     assert (moved["EyeOpenLeft"], moved["EyeOpenRight"], moved["MouthSmile"]) == (0.0, 1.0, 1.0)
 
 
-# --- What moves a machine ---------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("mover", MOVERS)
 def test_a_step_is_limited_and_a_halt_holds(mover):
     output = mover("127.0.0.1:1")
@@ -268,7 +266,6 @@ def test_an_offset_is_eased_away_after_a_break_of_the_network_alone(gone):
     assert yaw[2] == pytest.approx(0 if gone else 0.2, abs=1e-3)
 
 
-# --- Furhat -----------------------------------------------------------------------------------------------------------
 @pytest.mark.usefixtures("quick")
 def test_furhat_is_taken_over_and_given_back(monkeypatch):
     monkeypatch.setenv("FURHAT_KEY", "secret")
@@ -286,7 +283,6 @@ def test_furhat_is_taken_over_and_given_back(monkeypatch):
             output.open()
 
 
-# --- VTube Studio -----------------------------------------------------------------------------------------------------
 class Studio:
     """Answers of VTube Studio."""
 
@@ -367,7 +363,6 @@ def test_a_refusal_of_vtube_studio_is_one_line(tmp_path, answers, line):
                 studio.open()
 
 
-# --- Bad peers --------------------------------------------------------------------------------------------------------
 GREETING = b"HTTP/1.1 101 Switching Protocols\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Accept: "
 NOT_FOUND = b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n"
 

@@ -73,7 +73,6 @@ class Chip:
         os.write(self.presses, struct.pack("=QIIII24x", 1, 1 if pressed else 2, self.offset, 1, 1))
 
 
-# --- one row of docs/safety.md each, and all pairs of them ------------------------------------------------------------
 @dataclass
 class Cause:
     """A row: how it begins, how it stops being active (None: it never is), where it is cleared."""
@@ -156,7 +155,6 @@ def test_each_door_clears_its_own_causes_and_the_device_all_but_none_while_one_i
         assert latch.causes == tuple(cause.name for cause in left)
 
 
-# --- the latch ----------------------------------------------------------------------------------------------------
 def test_a_cause_that_comes_again_while_a_resume_reads_the_switches_stays() -> None:
     latch = HaltLatch()
     latch.close("key")
@@ -277,7 +275,6 @@ def test_a_handler_does_not_wait_for_the_latch_that_it_interrupts() -> None:
     assert signal.getsignal(signal.SIGUSR1) is signal.SIG_DFL
 
 
-# --- switches -----------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
     ("where", "says"),
     [

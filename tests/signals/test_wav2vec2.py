@@ -52,8 +52,7 @@ def test_rows_do_not_depend_on_how_a_stream_is_cut(folder, hop, sizes):
 
 
 def test_rows_of_a_hop_come_in_order(folder, model):
-    rows, _ = rows_of(model, NOISE)
-    longer, _ = rows_of(wav2vec2.Wav2Vec2(folder, hop_frames=8), NOISE)
+    (rows, _), (longer, _) = (rows_of(each, NOISE) for each in (model, wav2vec2.Wav2Vec2(folder, hop_frames=8)))
     assert np.abs(longer - rows[:24]).mean() < 0.7 * np.abs(longer - rows[1:]).mean()
 
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
 import secrets
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -125,25 +126,28 @@ class Study:
         Raises ConfigError for an invalid answer, or if it cannot be written.
         """
         shown = self._trials(participant)
-        trial = next((trial for trial in shown if trial.trial == number), None)
-        if trial is None:
+        if not 0 <= number < len(shown):
             raise ConfigError(f"trial = {number!r} is not one of this study (0 to {len(shown) - 1})")
         if set(chosen) != set(QUESTIONS) or not set(chosen.values()) <= {"left", "right", NEITHER}:
             raise ConfigError(f"answers: {', '.join(QUESTIONS)} want left, right or {NEITHER} each")
         if any((answer.participant, answer.trial) == (participant, number) for answer in self._answers):
             return  # the answer was sent twice on a bad connection
+        trial = shown[number]
         sides = {"left": trial.left, "right": trial.right, NEITHER: NEITHER}
         rows = [
             Preference(participant=participant, question=question, chosen=sides[chosen[question]], **asdict(trial))
             for question in QUESTIONS
         ]
+        size = self._file.stat().st_size if self._file.is_file() else 0
         try:
             with self._file.open("a", encoding="utf-8", newline="") as lines:
                 table = csv.DictWriter(lines, _COLUMNS)
-                if not lines.tell():
+                if not size:
                     table.writeheader()
                 table.writerows(map(asdict, rows))
         except OSError as error:
+            if self._file.is_file():
+                os.truncate(self._file, size)  # no part of an answer
             raise ConfigError(f"{self._file}: cannot be written: {error.strerror}") from error
         self._answers += rows
 

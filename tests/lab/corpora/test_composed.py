@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import soundfile
 from ami_tables import HEADERS
 
 from sfms_robot.data import data_dir
@@ -398,3 +399,10 @@ def test_several_jobs_write_the_files_of_one(tables, tmp_path):
         for jobs in ("1", "2")
     )
     assert one == two and len(one) > 3
+
+
+@pytest.mark.parametrize("samples", [1, 100, 16_000])
+def test_a_recording_without_speech_is_one_line(tmp_path, samples):
+    soundfile.write(tmp_path / "voice.wav", np.zeros(samples), 16_000)
+    with pytest.raises(ConfigError, match=r"voice\.wav: no speech found in it"):
+        read_voice(tmp_path / "voice.wav")

@@ -44,7 +44,6 @@ def one_line(ended, *said: str) -> None:
         assert part in ended.complaint
 
 
-# --- naturalness ------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 def test_naturalness_tells_how_it_moves_and_who_it_is_told_from(command_line, tmp_path, monkeypatch):
     monkeypatch.setattr(naturalness, "_STEPS", 6)  # the document is looked at here, not how well the nets tell apart
@@ -104,7 +103,6 @@ def test_a_few_dyads_are_too_few_to_tell_people_apart(command_line, tmp_path):
     one_line(command_line("evaluate", "naturalness", "--data", data), str(data), "3 dyads of test", "10 or more")
 
 
-# --- timing -----------------------------------------------------------------------------------------------------
 @pytest.fixture(scope="module")
 def tables(tmp_path_factory) -> Path:
     """Two minutes of a meeting in each part."""
@@ -144,7 +142,6 @@ def test_what_nobody_annotated_of_the_people_is_not_told(command_line, tmp_path,
     assert found["nod_hazard_auc"] is not None and found[f"{lacking}_hazard_auc"] is None
 
 
-# --- robustness -------------------------------------------------------------------------------------------------
 @pytest.mark.slow
 def test_robustness_has_a_row_for_every_way_and_names_those_outside(command_line):
     words = ("evaluate", "robustness", "--speakers", 1, "--minutes", 0.1, "--seeds", 2, "--jobs", 1, "--json")
@@ -166,7 +163,6 @@ def test_robustness_has_a_row_for_every_way_and_names_those_outside(command_line
     }
 
 
-# --- what cannot be played --------------------------------------------------------------------------------------
 @pytest.mark.parametrize("command", ["timing", "robustness"])
 @pytest.mark.parametrize(
     ("words", "said"),

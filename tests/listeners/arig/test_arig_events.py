@@ -56,7 +56,6 @@ def test_eyes_rest_whatever_the_weights_say(draws: str):
     assert not out[:, EYES].any() and out[:, FACE].std() > 0
 
 
-# --- states -----------------------------------------------------------------------------------------------------
 @given(
     scores=st.lists(st.floats(-20, 20), min_size=9, max_size=9),
     possible=st.lists(st.booleans(), min_size=7, max_size=7).filter(any),
@@ -102,7 +101,6 @@ def test_a_stream_nods_its_feedback(told):
     assert found == np.where(active, NODDING, LISTENING).tolist()
 
 
-# --- innovations ------------------------------------------------------------------------------------------------
 @given(rho=st.floats(0.0, 0.999), place=st.floats(-5, 5), other=st.floats(-5, 5), drawn=st.floats(-3, 3))
 def test_what_was_drawn_wrongly_is_forgotten_at_the_rate_of_the_data(rho, place, other, drawn):
     model = arig_model(draws="innovation")

@@ -128,7 +128,6 @@ def test_without_a_microphone_a_moving_mouth_is_a_voice():
     assert not of("nod", listen(conversation(deaf, face=np.zeros_like(face)))[0])
 
 
-# --- knobs ------------------------------------------------------------------------------------------------------
 @settings(max_examples=5)
 @given(st.floats(0.1, 30), st.floats(1.01, 4))
 def test_more_of_a_knob_is_never_less_of_its_hazard(rate, times):
@@ -138,7 +137,6 @@ def test_more_of_a_knob_is_never_less_of_its_hazard(rate, times):
     assert (high >= low).all() and high.max() > 0
 
 
-# --- who looks --------------------------------------------------------------------------------------------------
 def test_attention_unknown_is_between_flickering_is_none_and_without_a_face_it_is_as_asked_for():
     asks = {
         name: listen(conversation(attention=np.full(FRAMES, value)), own=())[1].mean()
@@ -204,7 +202,6 @@ def test_hazards_are_finite_whatever_comes_in(rows):
         assert all(math.isfinite(rate) and rate >= 0 for rate in memory.hazards_hz.values())
 
 
-# --- somebody's real history ------------------------------------------------------------------------------------
 def test_own_history_replaces_what_was_decided():
     frames = list(conversation())[:1000]
     nods = [ListenerEvent("nod", 10.0, 2.0, 0.1), ListenerEvent("nod", 20.0, 0.5, 0.1)]

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import binary_dilation, uniform_filter1d
 from scipy.signal import oaconvolve
 
 from sfms_robot.errors import ConfigError
@@ -95,8 +95,8 @@ def find_laughter(folders: Sequence[Path]) -> dict[Split, list[Floats]]:
         rows = columns(file) if file.is_file() else {}
         if not {"clip", "start_s", "end_s", "kind", "text"} <= rows.keys():
             continue
-        starts_s, ends_s = (map(float, rows[name]) for name in ("start_s", "end_s"))
-        said = list(zip(rows["clip"], starts_s, ends_s, rows["kind"], rows["text"], strict=True))
+        spans_s = (map(float, rows[name]) for name in ("start_s", "end_s"))
+        said = list(zip(rows["clip"], *spans_s, rows["kind"], rows["text"], strict=True))
         for clip, start, end, _, text in said:
             spoken_into = any(c == clip and kind == "w" and a < end and b > start for c, a, b, kind, _ in said)
             if text == "laugh" and end - start >= _LAUGH_S and not spoken_into and (folder / clip).is_file():
@@ -132,32 +132,29 @@ def read_voice(file: Path) -> VoiceClip:
     """Read a sound file, and the mouth recorded with it, if any (FACEGOOD weights, NAME.npz, or a face track)."""
     audio = read_audio(file)
     active = voice_activity(audio, _GRAIN / AUDIO_HZ)
-    active = np.convolve(active, [1, 1, 1], "same") > 0  # one grain of margin keeps soft beginnings and endings
+    active = binary_dilation(active)  # one grain of margin keeps soft beginnings and endings
     speech = [(a * _GRAIN, b * _GRAIN) for a, b in runs(active) if b - a >= 5]
     if not speech:
         raise ConfigError(f"{file}: no speech found in it")
     pieces, breaks, total = [], [], 0
     for number, (start, end) in enumerate(speech):
         pieces.append(_eased(audio[start:end], _JOIN))
-        total += len(pieces[-1])
+        total += end - start
         if number + 1 == len(speech) or speech[number + 1][0] - end >= _PHRASE:
             breaks.append(total)
     joined = _levelled(np.concatenate(pieces))
     keep = ~_lulls(joined)
     ends = np.cumsum(keep)[np.array(breaks) // _GRAIN - 1] * _GRAIN
-    joined = joined.reshape(-1, _GRAIN)[keep].reshape(-1)
     origin = np.concatenate([np.arange(start, end, _GRAIN) for start, end in speech])[keep]
-    name = file.parent.name.removeprefix("facegood_") if file.stem == "speech" else file.stem
     loudness = np.sqrt(np.mean(np.concatenate([audio[start:end] for start, end in speech]) ** 2))
-    whole = np.clip(audio * (_LEVEL / loudness), -1, 1)
     return VoiceClip(
-        name=name,
-        audio=joined,
+        name=file.parent.name.removeprefix("facegood_") if file.stem == "speech" else file.stem,
+        audio=joined.reshape(-1, _GRAIN)[keep].ravel(),
         origin=origin,
         ends=ends,
         mouth=_mouth(file),
         noise=_pause_spectrum(audio, active),
-        recording=whole,
+        recording=np.clip(audio * (_LEVEL / loudness), -1, 1),
     )
 
 
@@ -267,10 +264,9 @@ def _soften(mouth: Floats) -> Floats:
 
 def room(samples: int, voice: VoiceClip, rng: Rng) -> Floats:
     """Return a noise floor with the spectrum of the recording's pauses, drifting, at -70 to -48 dB of full scale."""
-    flat = rng.standard_normal(samples, np.float32)
     kernel = np.fft.irfft(voice.noise).astype(np.float32)
     kernel = np.roll(kernel, len(kernel) // 2) * np.hanning(len(kernel)).astype(np.float32)
-    coloured = oaconvolve(flat, kernel, mode="same")
+    coloured = oaconvolve(rng.standard_normal(samples, np.float32), kernel, mode="same")
     coloured /= np.sqrt(np.mean(coloured**2)) + 1e-12
     knots = np.arange(0, samples + AUDIO_HZ, AUDIO_HZ)
     level_db = rng.uniform(-70, -48) + np.interp(np.arange(samples), knots, rng.normal(0, 1, len(knots)))
