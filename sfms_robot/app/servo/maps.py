@@ -46,7 +46,7 @@ def list_maps(more: Iterable[Path] = ()) -> list[Report]:
             {
                 **each.model_dump(include={"model", "vendor", "family", "protocol"}),
                 "number": each.model_number,
-                "firmware": "any" if (low, high) == (0, 255) else f"{low}.." if high == 255 else f"..{high}",
+                "firmware": "any" if (low, high) == (0, 255) else f"{low or ''}..{'' if high == 255 else high}",
                 "registers": len(each.registers) or None,
                 "channels": each.channels,
                 "ticks_per_turn": each.ticks_per_revolution,
