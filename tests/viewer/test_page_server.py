@@ -6,7 +6,6 @@ import json
 import pytest
 
 from sfms_robot.errors import PacketError
-from sfms_robot.viewer import page_server
 from sfms_robot.viewer.page_server import IDLE_S, MOST_VISITORS, OUTBOX, PageServer, Visitors
 
 
@@ -97,7 +96,7 @@ def test_of_pictures_the_newest_is_sent_who_reads_nothing_is_found_out_and_a_flo
 
 
 def test_a_run_that_is_over_is_served_until_each_visitor_has_its_replay(monkeypatch):
-    monkeypatch.setattr(page_server, "REPLAY_S", None)  # no limit
+    monkeypatch.setattr("sfms_robot.viewer.page_server.REPLAY_S", None)  # no limit
 
     async def served():
         page = PageServer(lambda *_: None, None)

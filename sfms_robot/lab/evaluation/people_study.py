@@ -20,6 +20,7 @@ import json
 import os
 import secrets
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from itertools import combinations
 from pathlib import Path
@@ -146,7 +147,7 @@ class Study:
                     table.writeheader()
                 table.writerows(map(asdict, rows))
         except OSError as error:
-            if self._file.is_file():
+            with suppress(OSError):
                 os.truncate(self._file, size)  # no part of an answer
             raise ConfigError(f"{self._file}: cannot be written: {error.strerror}") from error
         self._answers += rows
@@ -289,11 +290,11 @@ def _voices(data: Path | None, split: Split, count: int, length: int) -> list[_S
 
 
 def read_answers(file: Path) -> list[Preference]:
-    """Read answers. Raises ConfigError with the line of the file."""
+    """Read answers; an empty file has none. Raises ConfigError with the line of the file."""
     try:
         with file.open(encoding="utf-8", newline="") as lines:
             rows = csv.DictReader(lines)
-            if tuple(rows.fieldnames or ()) != _COLUMNS:
+            if tuple(rows.fieldnames or _COLUMNS) != _COLUMNS:
                 raise ConfigError(f"{file}: not answers of a comparison: its columns are not {', '.join(_COLUMNS)}")
             return [_answer(file, number, row) for number, row in enumerate(rows, start=2)]
     except (OSError, UnicodeDecodeError) as error:

@@ -55,19 +55,20 @@ def test_answers_are_kept_a_person_goes_on_and_each_counts_once(tmp_path):
     assert again.next("me") == {"answered": 3, "trials": 3} and len(read_answers(tmp_path / "answers.csv")) == 16
 
 
-def test_a_full_disk_leaves_no_part_of_an_answer(tmp_path):
-    first, limits = study(tmp_path), resource.getrlimit(resource.RLIMIT_FSIZE)
-    first.answer("me", 0, ALL_LEFT)
-    before = (tmp_path / "answers.csv").read_bytes()
-    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) + 10, limits[1]))
+@pytest.mark.parametrize("given", [0, 1])
+def test_a_full_disk_leaves_no_part_of_an_answer(tmp_path, given):
+    first, file, limits = study(tmp_path), tmp_path / "answers.csv", resource.getrlimit(resource.RLIMIT_FSIZE)
+    for number in range(given):
+        first.answer("me", number, ALL_LEFT)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10 + (file.stat().st_size if given else 0), limits[1]))
     try:
         with pytest.raises(ConfigError, match=r"answers\.csv: cannot be written: File too large"):
-            first.answer("me", 1, ALL_LEFT)
+            first.answer("me", 2, ALL_LEFT)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert (tmp_path / "answers.csv").read_bytes() == before and first.next("me")["answered"] == 1
-    first.answer("me", 1, ALL_LEFT)
-    assert len(read_answers(tmp_path / "answers.csv")) == 8
+    assert len(read_answers(file)) == 4 * given and Study(tmp_path).next("me")["answered"] == given
+    first.answer("me", 2, ALL_LEFT)
+    assert len(read_answers(file)) == 4 * given + 4
 
 
 def test_the_page_is_not_told_which_is_which(tmp_path):
