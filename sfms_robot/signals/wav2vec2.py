@@ -85,7 +85,7 @@ class Wav2Vec2:
     def _rows(self, samples: Floats) -> Floats:
         """Return the rows (hops * hop_frames, dim) of all hops that are whole in `samples` (n,), the past first."""
         windows = np.lib.stride_tricks.sliding_window_view(samples, self._window)[:: self._hop]
-        rows = [np.zeros((0, self.dim), np.float32)]
+        rows = list[Floats]()
         for at in range(0, len(windows), BATCH):
             sound = torch.from_numpy(windows[at : at + BATCH].copy()).to(self._device)
             if self._normalise:

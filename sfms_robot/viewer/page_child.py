@@ -19,7 +19,7 @@ from sfms_robot.face.robot_scene import RobotScene
 from sfms_robot.ports import Facts
 from sfms_robot.processes import ParentPipe, PipeWriter, give_way
 from sfms_robot.viewer.page_messages import LONGEST_PERSON
-from sfms_robot.viewer.page_process import BEAT_S, Address
+from sfms_robot.viewer.page_process import BEAT_S, REPLAY_S, Address
 from sfms_robot.viewer.page_server import PageServer
 from sfms_robot.viewer.web_server import WebLoop, listen_at, web_server
 
@@ -106,6 +106,7 @@ async def _serve(address: Address, parent: ParentPipe, scene_of: SceneOf) -> Non
         writer.send(pickle.dumps(None))  # a sign of life
         with suppress(TimeoutError):
             await asyncio.wait_for(over.wait(), BEAT_S)
-    await page.replayed()
+    with suppress(TimeoutError):
+        await asyncio.wait_for(page.replayed(), REPLAY_S)
     server.should_exit = True
     await serving

@@ -25,7 +25,8 @@ from sfms_robot.errors import ConfigError, PortError, RobotError
 from sfms_robot.processes import LIMITS, Child, Ended, Supervised
 
 START_LIMIT_S: Final = 30.0  # importing on a small board with a cold disk
-CLOSE_LIMIT_S: Final = 8.0  # longer than visitors may take to fetch a run that is over (`page_server.REPLAY_S`)
+REPLAY_S: Final = 5.0  # time after the end of a run in which visitors may fetch /runs/last
+CLOSE_LIMIT_S: Final = REPLAY_S + 3.0
 BEAT_S: Final = 0.5
 CHILD: Final = "sfms_robot.viewer.page_child:main"
 PORT: Final = 8780

@@ -50,7 +50,6 @@ PERSON_S: Final = 0.001  # time allotted to a piece of sound, or a face
 PERSON_BYTES_PER_S: Final = 4e6
 BURST_S: Final = 0.25
 FREE: Final = ("hello", "ping", "take", "give")  # commands that need no controls
-REPLAY_S: Final = 5.0  # time after the end of a run in which visitors may fetch /runs/last
 _LOOK_S: Final = 0.05
 _LINES_AT_ONCE: Final = 10  # for a platform each line takes 1.5 ms
 
@@ -289,11 +288,9 @@ class PageServer:
         self.tell(message_json(type="over", report=report))
 
     async def replayed(self) -> None:
-        """Wait until all visitors of a run that is over have fetched it, which their pages do; `REPLAY_S` at most."""
-        with suppress(TimeoutError):
-            async with asyncio.timeout(REPLAY_S):
-                while self._over is not None and self._fetched < len(self._visitors):
-                    await asyncio.sleep(_LOOK_S)
+        """Wait until all visitors of a run that is over have fetched it, which their pages do."""
+        while self._over is not None and self._fetched < len(self._visitors):
+            await asyncio.sleep(_LOOK_S)
 
     def answer(self, number: int, message: bytes) -> None:
         """Send a message to one visitor, if it is still connected."""

@@ -95,9 +95,7 @@ def test_of_pictures_the_newest_is_sent_who_reads_nothing_is_found_out_and_a_flo
     assert pauses[:24] == [0.0] * 24 and pauses[-1] == pytest.approx(0.75)
 
 
-def test_a_run_that_is_over_is_served_until_each_visitor_has_its_replay(monkeypatch):
-    monkeypatch.setattr("sfms_robot.viewer.page_server.REPLAY_S", None)  # no limit
-
+def test_a_run_that_is_over_is_served_until_each_visitor_has_its_replay():
     async def served():
         page = PageServer(lambda *_: None, None)
         page.begin({}, lambda: None)
