@@ -62,23 +62,24 @@ class Visitor:
 
     Attributes:
         number: number that no earlier visitor had.
+        in_browser: whether it is a page in a browser, which fetches a run that is over.
         allowed: whether it has sent the token, or there is none.
         malformed: count of its messages that could not be used.
         used_s: time of its last use of the controls.
         behind: whether it reads so slowly that it has to be disconnected.
     """
 
-    def __init__(self, number: int, allowed: bool, now_s: float) -> None:
-        self.number, self.allowed, self.used_s = number, allowed, now_s
+    def __init__(self, number: int, in_browser: bool, allowed: bool, now_s: float) -> None:
+        self.number, self.in_browser, self.allowed, self.used_s = number, in_browser, allowed, now_s
         self.malformed, self.behind = 0, False
-        self._picture: str | None = None
+        self._picture = ""
         self._outbox = deque[str]()
         self._something = asyncio.Event()
-        self._due_s = now_s - BURST_S
+        self._due_s = 0.0
 
     def tell(self, message: bytes) -> None:
         """Send a message, after those that still wait."""
-        self.behind = self.behind or len(self._outbox) >= OUTBOX
+        self.behind |= len(self._outbox) >= OUTBOX
         self._outbox.append(message.decode())
         self._something.set()
 
@@ -93,8 +94,8 @@ class Visitor:
         if self._outbox:
             message = self._outbox.popleft()
         else:
-            message, self._picture = self._picture or "", None
-        if not self._outbox and self._picture is None:
+            message, self._picture = self._picture, ""
+        if not (self._outbox or self._picture):
             self._something.clear()
         return message
 
@@ -134,13 +135,12 @@ class Visitors:
         """Return a visitor by its number; None if it is not connected any more."""
         return self._by_number.get(number)
 
-    def enter(self) -> Visitor:
+    def enter(self, in_browser: bool = False) -> Visitor:
         """Admit another visitor. Raises PacketError when there are too many."""
         if len(self._by_number) >= MOST_VISITORS:
             raise PacketError(f"{MOST_VISITORS} visitors look at this head already")
         self._came += 1
-        visitor = Visitor(self._came, self._token is None, self._now())
-        self._by_number[visitor.number] = visitor
+        visitor = self._by_number[self._came] = Visitor(self._came, in_browser, self._token is None, self._now())
         return visitor
 
     def leave(self, visitor: Visitor) -> None:
@@ -157,7 +157,7 @@ class Visitors:
         """Check the version of a page, and its token. Raises PacketError if either is wrong."""
         if version != VERSION:
             raise PacketError(f"version: expected {VERSION}, got {version}: load the page again")
-        if self._token is not None and token:
+        if token:
             if not token_admits(token, self._token):
                 raise PacketError("the token is not the one that was printed when the robot started")
             visitor.allowed = True
@@ -288,14 +288,13 @@ class PageServer:
         self.tell(message_json(type="over", report=report))
 
     async def replayed(self) -> None:
-        """Wait until all visitors of a run that is over have fetched it, which their pages do."""
-        while self._over is not None and self._fetched < len(self._visitors):
+        """Wait until the pages that are open have fetched a run that is over."""
+        while self._over is not None and self._fetched < sum(each.in_browser for each in self._visitors):
             await asyncio.sleep(_LOOK_S)
 
     def answer(self, number: int, message: bytes) -> None:
         """Send a message to one visitor, if it is still connected."""
-        visitor = self._visitors.get(number)
-        if visitor is not None:
+        if visitor := self._visitors.get(number):
             visitor.tell(message)
 
     def recorded(self, file: Path | None, record: Facts | None) -> None:
@@ -316,8 +315,8 @@ class PageServer:
 
     async def _lines(self) -> AsyncIterator[bytes]:
         """Yield the hello, then the messages of the run, oldest first; other tasks run in between."""
-        hello, shown = self._hello, _values(self._new_scene())
-        yield message_json(type="hello", **hello | {"over": True, "replay": True}) + b"\n"
+        shown = _values(self._new_scene())
+        yield message_json(type="hello", **self._hello | {"over": True, "replay": True}) + b"\n"
         kept = list(self._history)
         for first in range(0, len(kept), _LINES_AT_ONCE):
             part = kept[first : first + _LINES_AT_ONCE]
@@ -350,7 +349,7 @@ class PageServer:
         await socket.accept()
         await self._began.wait()
         try:
-            visitor = self._visitors.enter()
+            visitor = self._visitors.enter(in_browser="origin" in socket.headers)  # RFC 6455, 4.1: browsers send it
         except PacketError as error:
             await _refuse(socket, str(error))
             return
@@ -390,8 +389,7 @@ class PageServer:
                     return
                 visitor.tell(message_json(type="error", error=str(error)))
             cost_s = COMMAND_S if text is not None else PERSON_S + len(data) / PERSON_BYTES_PER_S
-            if pause_s := visitor.pause_s(cost_s, time.monotonic()):
-                await asyncio.sleep(pause_s)
+            await asyncio.sleep(visitor.pause_s(cost_s, time.monotonic()))
 
     def _command(self, visitor: Visitor, name: str, values: Report) -> None:
         if name == "hello":

@@ -95,12 +95,12 @@ def test_of_pictures_the_newest_is_sent_who_reads_nothing_is_found_out_and_a_flo
     assert pauses[:24] == [0.0] * 24 and pauses[-1] == pytest.approx(0.75)
 
 
-def test_a_run_that_is_over_is_served_until_each_visitor_has_its_replay():
+def test_a_run_that_is_over_is_served_until_each_page_has_its_replay():
     async def served():
         page = PageServer(lambda *_: None, None)
         page.begin({}, lambda: None)
         await page.replayed()  # a run that goes on has none
-        page._visitors.enter(), page._visitors.enter()
+        [page._visitors.enter(in_browser) for in_browser in (True, True, False)]  # a program fetches nothing
         page.end({})
         waiting = asyncio.create_task(page.replayed())
         for _ in range(2):
