@@ -61,7 +61,7 @@ class FromRun:
             self._page.answer(visitor, orjson.dumps({"type": "error", "error": told["error"]}))
         elif do == "recorded":
             file = told["file"]
-            self._page.recorded(None if file is None else Path(file), told["record"])
+            self._page.recorded(file and Path(file), told["record"])
         else:
             self._page.tell(orjson.dumps({"type": do, **told}), keep=do != "status")
 

@@ -49,7 +49,7 @@ COMMAND_S: Final = 0.004  # time allotted to a command, when many arrive
 PERSON_S: Final = 0.001  # time allotted to a piece of sound, or a face
 PERSON_BYTES_PER_S: Final = 4e6
 BURST_S: Final = 0.25
-FREE: Final = ("hello", "ping", "take", "give")  # commands that need no controls
+LOAD_S: Final = 30.0
 _LOOK_S: Final = 0.05
 _LINES_AT_ONCE: Final = 10  # for a platform each line takes 1.5 ms
 
@@ -180,13 +180,6 @@ class Visitors:
         else:
             visitor.tell(self._controls_json(visitor))
 
-    def admit(self, visitor: Visitor, command: str) -> None:
-        """Check that a command is allowed now, and give the visitor the controls that it needs. Raises PacketError."""
-        if command == "halt":
-            visitor.check_allowed()
-        elif command not in FREE:
-            self.take(visitor)
-
     def holds(self, visitor: Visitor) -> bool:
         """Return whether a visitor has the controls, which counts as use."""
         if visitor is not self._holder:
@@ -227,6 +220,7 @@ class PageServer:
         self._recording: Path | None = None
         self._over: Facts | None = None  # report of a run that is over
         self._fetched = 0  # how often that run was fetched
+        self._loads_until_s = 0.0  # until then a browser that loads the page is a visitor
         self._history = deque[tuple[bool, bytes]](maxlen=KEPT_FRAMES)  # (packed picture or not, message)
         self._files, self._human = CompressedFiles(), CompressedFiles(HUMAN)
         self.app = application(
@@ -305,7 +299,14 @@ class PageServer:
 
     # --- over HTTP ---
 
+    def _tell_watched(self) -> None:
+        """Report the number of visitors to the run, with a browser that loads the page, for `LOAD_S` at most."""
+        self._send_run(0, {"watched": len(self._visitors) + (time.monotonic() < self._loads_until_s)})
+
     async def _index(self, request: Request) -> Response:
+        self._loads_until_s = time.monotonic() + LOAD_S
+        self._tell_watched()
+        asyncio.get_running_loop().call_later(LOAD_S, self._tell_watched)
         return await self._files.get_response("index.html", request.scope)
 
     async def _last_run(self, request: Request) -> Response:
@@ -354,14 +355,15 @@ class PageServer:
             await _refuse(socket, str(error))
             return
         visitor.tell(self._hello_json(visitor))
-        self._send_run(0, {"watched": len(self._visitors)})
+        self._loads_until_s = 0.0
+        self._tell_watched()
         sending = asyncio.create_task(self._send(socket, visitor))
         try:
             await self._receive(socket, visitor)
         finally:
             sending.cancel()
             self._visitors.leave(visitor)
-            self._send_run(0, {"watched": len(self._visitors)})
+            self._tell_watched()
 
     async def _send(self, socket: WebSocket, visitor: Visitor) -> None:
         with suppress(WebSocketDisconnect, RuntimeError):  # the visitor has disconnected
@@ -401,7 +403,10 @@ class PageServer:
         elif name == "give":
             self._visitors.give(visitor)
         else:
-            self._visitors.admit(visitor, name)
+            if name == "halt":  # needs no controls
+                visitor.check_allowed()
+            else:
+                self._visitors.take(visitor)
             self._send_run(visitor.number, {"command": name, "values": values})
 
     def _hello_json(self, visitor: Visitor) -> bytes:

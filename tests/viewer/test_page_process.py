@@ -259,7 +259,7 @@ def test_half_open_requests_are_ended_in_time_and_others_are_answered_meanwhile(
     class Prompt(PromptConnection):
         limit_s = CONNECTION_S / 20
 
-    server = web_server(PageServer(Asked(), None).app, Prompt, ws="websockets-sansio")
+    server = web_server(PageServer(lambda *_: None, None).app, Prompt, ws="websockets-sansio")
     listening = socket.create_server(("127.0.0.1", 0), backlog=200)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
     thread.start()

@@ -4,6 +4,7 @@ import asyncio
 import json
 
 import pytest
+from starlette.requests import Request
 
 from sfms_robot.errors import PacketError
 from sfms_robot.viewer.page_server import IDLE_S, MOST_VISITORS, OUTBOX, PageServer, Visitors
@@ -13,8 +14,7 @@ class Here:
     """Visitors, and a clock that is set."""
 
     def __init__(self, token=None):
-        self.now_s = 100.0
-        self.left = []
+        self.now_s, self.left = 100.0, []
         self.visitors = Visitors(token, self.left.append, lambda: self.now_s)
 
 
@@ -33,16 +33,14 @@ def told(visitor):
 def test_who_does_something_first_has_the_controls_until_given_back_or_not_used():
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
-    here.visitors.admit(a, "show")
+    here.visitors.take(a)
     assert here.visitors.controls(a) == "you" and here.visitors.controls(b) == "other"
     assert told(b) == [{"type": "controls", "held": "other", "needs_token": False}]
     with pytest.raises(PacketError, match="another visitor holds the controls"):
-        here.visitors.admit(b, "show")
-    here.visitors.admit(b, "halt")  # needs no controls
-    assert here.visitors.controls(a) == "you"
+        here.visitors.take(b)
     here.visitors.give(a)
     assert here.left == [a.number] and here.visitors.controls(b) == "nobody"
-    here.visitors.admit(b, "show")
+    here.visitors.take(b)
     assert here.visitors.controls(b) == "you"
     here = Here()
     a, b = here.visitors.enter(), here.visitors.enter()
@@ -84,20 +82,21 @@ def test_of_pictures_the_newest_is_sent_who_reads_nothing_is_found_out_and_a_flo
     visitor.tell(b'{"n":1}')
     visitor.tell(b'{"n":2}')
     assert told(visitor) == [{"n": 1}, {"n": 2}, "new"]
-    visitor = Here().visitors.enter()
     for _ in range(OUTBOX):
         visitor.tell(b"{}")
     assert not visitor.behind
     visitor.tell(b"{}")
     assert visitor.behind
-    visitor = Here().visitors.enter()
     pauses = [visitor.pause_s(0.01, 100.0) for _ in range(100)]
     assert pauses[:24] == [0.0] * 24 and pauses[-1] == pytest.approx(0.75)
 
 
 def test_a_run_that_is_over_is_served_until_each_page_has_its_replay():
     async def served():
-        page = PageServer(lambda *_: None, None)
+        sent = []
+        page = PageServer(lambda _, content: sent.append(content["watched"]), None)
+        await page._index(Request({"type": "http", "method": "GET", "headers": []}))
+        assert sent == [1]  # a browser that loads the page stays a visitor, however slow it is
         page.begin({}, lambda: None)
         await page.replayed()  # a run that goes on has none
         [page._visitors.enter(in_browser) for in_browser in (True, True, False)]  # a program fetches nothing

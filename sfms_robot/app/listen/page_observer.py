@@ -30,6 +30,7 @@ from sfms_robot.runtime.planned_events import PlannedEvents
 from sfms_robot.runtime.recorder import RUN_FILE, Recorder
 from sfms_robot.signals import voice_activity
 from sfms_robot.signals.audio import energy_db
+from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_messages import NOTHING, VERSION, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
@@ -51,7 +52,7 @@ def page_facts(
     """Return the `hello` of docs/reference/protocol.md, except for the entries that differ between visitors.
 
     Args:
-        speaker: name of the recorded person; None: a live person.
+        speaker: name of the recorded person, or "default"; None: a live person.
         feeds: voice and face, if a visitor may provide them.
         choices: True if another listener, speaker or seed may be chosen.
     """
@@ -61,7 +62,7 @@ def page_facts(
         "head": head.name,
         "port": options.port,
         "listener": options.listener_name,
-        "speaker": speaker,
+        "speaker": DEFAULT_SPEAKER if speaker == "default" else speaker,
         "seed": options.seed,
         "listeners": _lines(shipped_listeners()) if choices else [],
         "speakers": _lines(shipped_speakers()) if choices else [],

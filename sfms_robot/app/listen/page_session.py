@@ -31,10 +31,10 @@ from sfms_robot.frames import NEUTRAL
 from sfms_robot.ports import Facts, Observer, PlanFeed, Tick
 from sfms_robot.runtime.safety import Interrupt
 from sfms_robot.sources.net_person import PageVisitor
-from sfms_robot.sources.registry import BROWSER, DEFAULT_SPEAKER
+from sfms_robot.sources.registry import BROWSER
 from sfms_robot.viewer.page_process import PageProcess
 
-AWAY_S: Final = 5.0  # time without visitors after which the page is given up; reloading a page takes less
+AWAY_S: Final = 5.0  # time without visitors after which the page is given up
 LEFT_S: Final = 30.0
 PAUSE_S: Final = 3.0  # pause at rest before the next recorded person talks
 BY_PAGE: Final = "page"  # a cause of a halt, and the door that clears it (`runtime.halt`)
@@ -87,12 +87,11 @@ class PageSession:
             scene = scene_of(head, options.packages)  # a broken picture is reported before anything moves
             for line in scene.left_out:
                 logger.warning("picture of the head: %s", line)
-            speaker = DEFAULT_SPEAKER if options.hears == "default" else options.hears
             facts = page_facts(
                 head,
                 options,
                 controls.knobs,
-                speaker if speaker in speaker_names() else None,
+                options.hears if options.hears in ("default", *speaker_names()) else None,
                 feeds=FEEDS if self._choices else by_visitor,
                 choices=self._choices,
             )
@@ -101,7 +100,7 @@ class PageSession:
             self.recorder = PageRecorder(self.page, self._folder, joints, run_facts(head, options))
             stack.callback(self.recorder.close)
             self.reach = controls
-            stack.callback(self._ended)
+            stack.callback(self._ended, controls)
             lonely = EndsAlone(page=self.page, interrupt=controls.interrupt, left_s=LEFT_S if by_visitor else AWAY_S)
             watchers = [watcher, self.recorder, *observers]
             if self._choices and (by_visitor or self._further):  # only visitors keep it running
@@ -131,12 +130,11 @@ class PageSession:
         self.options, self._wanted, self._further = replace(self._wanted, **self._set), None, True
         return True
 
-    def _ended(self) -> None:
+    def _ended(self, controls: RunControls) -> None:
         """Forget the controls of the run, and keep the settings that visitors changed in it."""
-        reach, self.reach = self.reach, None
-        assert reach is not None
-        self._set = {kind: words_of(values) for kind, values in reach.knobs.values.items()}
-        self._set["calmness"] = reach.calmness
+        self.reach = None
+        self._set = {kind: words_of(values) for kind, values in controls.knobs.values.items()}
+        self._set["calmness"] = controls.calmness
 
     # --- from visitors; in the page's thread ---
 

@@ -27,7 +27,6 @@ from sfms_robot.data import Report
 from sfms_robot.errors import ConfigError
 from sfms_robot.frames import FRAME_HZ, FRAME_SAMPLES
 from sfms_robot.signals.audio import energy_db
-from sfms_robot.sources.registry import DEFAULT_SPEAKER
 from sfms_robot.viewer.page_messages import NOTHING, pack_picture, rare_json
 from sfms_robot.viewer.page_process import PageProcess
 
@@ -78,12 +77,12 @@ def show_recording(folder: Path, page: PageProcess) -> None:
     Raises ConfigError for a folder without a run, and if the recorded head is not available or has other joints now.
     """
     recording = read_recording(folder)
-    about, speaker = recording.about, recording.about.get("audio")
+    about = recording.about
     head = load_head(about["head"], servos=False)
     if tuple(head.joints) != recording.joints:
         raise ConfigError(f"head {head.name!r} has other joints than when the run was recorded")
     options = RunOptions(port=about["port"], listener=about["listener"], seed=int(about["seed"]))
-    facts = page_facts(head, options, LiveKnobs(head), DEFAULT_SPEAKER if speaker == "default" else speaker)
+    facts = page_facts(head, options, LiveKnobs(head), about.get("audio"))
     page.say("begin", scene=about["head"], **facts | {"replay": True})
     for time_s, kind in recording.events:
         page.say("event", event=kind, at_s=round(time_s, 3))
