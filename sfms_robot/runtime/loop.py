@@ -144,7 +144,8 @@ def drive(
         try:
             parts.source.start(clock.origin_s + start_s)
             for tick in tick_times(clock, rate_hz, start_s):
-                if interrupted() or tick.time_s > duration_s + 1e-9:  # the tick at the very end reads the last frame
+                # The tick due at the very end reads the last frame, however late it is.
+                if interrupted() or tick.time_s - tick.skipped / rate_hz > duration_s + 1e-9:
                     break
                 before_rad = state.goals_rad
                 state = _heard(parts, observers, log, tick.time_s, state)
@@ -178,8 +179,9 @@ def drive(
                     )
                 )
         finally:
-            ticks = tick_times(clock, rate_hz, start_s)
-            log.state = _ended(parts, observers, log, ticks, clock.now_s() - start_s, state)
+            log.state = _ended(
+                parts, observers, log, tick_times(clock, rate_hz, start_s), clock.now_s() - start_s, state
+            )
     finally:
         parts.bus.stop("release")
     return "interrupted" if interrupted() else "done"
@@ -234,13 +236,12 @@ def _judged(parts: Parts, log: RunLog, now_s: float, state: LoopState) -> LoopSt
     presence = state.presence
     listener = ("listener",) if parts.feed.lost else ()
     lost = (*parts.source.missing, *listener, *parts.missing(), *state.lost_joints)
-    eased_in = bool(now_s - state.since_s.max(initial=0.0) >= EASE_S)
     halted, released = parts.halt.causes, state.released
     if not halted and state.run.name == "halted" and not state.stands:
         halted = state.run.why  # a halt does not end before the head stands
     run = state.run.then(
         now_s,
-        eased_in=eased_in,
+        eased_in=bool(now_s - state.since_s.max(initial=0.0) >= EASE_S),
         person=presence.person(now_s),
         speaking=presence.speaking(now_s),
         lost=lost,

@@ -14,6 +14,6 @@ def test_a_listener_is_measured_beside_the_servo_loop(tmp_path):
     checkpoint.save_config(tmp_path, listener.settings)
     checkpoint.save_weights(tmp_path / checkpoint.WEIGHTS, listener.model)
     found = in_run(tmp_path, duration_s=2.0)
-    assert (found["frames"], found["duration_s"]) == (50, 2.0)
+    assert found["frames"] == 50 and found["duration_s"] >= 2.0
     assert found["frames_per_s"] > 0 and found["frame_to_wire_ms"]["p99"] > 0
     assert 0 <= found["late_ticks"] <= found["ticks"]
