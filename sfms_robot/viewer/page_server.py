@@ -49,7 +49,7 @@ COMMAND_S: Final = 0.004  # time allotted to a command, when many arrive
 PERSON_S: Final = 0.001  # time allotted to a piece of sound, or a face
 PERSON_BYTES_PER_S: Final = 4e6
 BURST_S: Final = 0.25
-LOAD_S: Final = 30.0
+LOAD_S: Final = 30.0  # longest time that a browser may take to load the page
 _LOOK_S: Final = 0.05
 _LINES_AT_ONCE: Final = 10  # for a platform each line takes 1.5 ms
 
@@ -299,10 +299,6 @@ class PageServer:
 
     # --- over HTTP ---
 
-    def _tell_watched(self) -> None:
-        """Report the number of visitors to the run, with a browser that loads the page, for `LOAD_S` at most."""
-        self._send_run(0, {"watched": len(self._visitors) + (time.monotonic() < self._loads_until_s)})
-
     async def _index(self, request: Request) -> Response:
         self._loads_until_s = time.monotonic() + LOAD_S
         self._tell_watched()
@@ -364,6 +360,10 @@ class PageServer:
             sending.cancel()
             self._visitors.leave(visitor)
             self._tell_watched()
+
+    def _tell_watched(self) -> None:
+        """Report the number of visitors to the run, with a browser that loads the page, for `LOAD_S` at most."""
+        self._send_run(0, {"watched": len(self._visitors) + (time.monotonic() < self._loads_until_s)})
 
     async def _send(self, socket: WebSocket, visitor: Visitor) -> None:
         with suppress(WebSocketDisconnect, RuntimeError):  # the visitor has disconnected

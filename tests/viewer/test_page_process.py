@@ -190,10 +190,10 @@ def test_commands_reach_the_run_and_what_it_refuses_is_told_to_who_asked(page):
         assert heard(visitor, "controls")["held"] == "you" and heard(other, "controls")["held"] == "other"
         says(visitor, "speaker", name="x")
         assert heard(visitor, "error")["error"] == "speaker 'x' is not there"
+        says(other, "halt")  # needs no controls, and takes none
+        assert page.asked.next() == ("halt", {})
         says(other, "neutral")
         assert heard(other, "error")["error"] == "another visitor holds the controls"
-        says(other, "halt")
-        assert page.asked.next() == ("halt", {})
 
 
 def test_of_nobody_but_the_holder_voice_and_face_are_taken(page):

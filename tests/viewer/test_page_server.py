@@ -99,7 +99,8 @@ def test_a_run_that_is_over_is_served_until_each_page_has_its_replay():
         assert sent == [1]  # a browser that loads the page stays a visitor, however slow it is
         page.begin({}, lambda: None)
         await page.replayed()  # a run that goes on has none
-        [page._visitors.enter(in_browser) for in_browser in (True, True, False)]  # a program fetches nothing
+        for in_browser in (True, True, False):  # a program fetches nothing
+            page._visitors.enter(in_browser)
         page.end({})
         waiting = asyncio.create_task(page.replayed())
         for _ in range(2):
