@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Literal
 
 from typer import Option
@@ -51,7 +52,7 @@ def emulate(
         stored=stored,
         starts=start,
     )
-    with chains as running:
+    with chains as running, suppress(KeyboardInterrupt):
         if json:
             print_json(described(running, head))
         else:

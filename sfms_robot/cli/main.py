@@ -170,6 +170,8 @@ def _outcome(words: list[str]) -> tuple[int, str | None]:
             return _said(UNEXPECTED, problem)
         return _said(ConfigError.exit_code, f"{_flagged(str(error.filename), words)}: {problem}")
     except Exception as error:
+        if str(error) == "release unlocked lock" and isinstance(error.__context__, KeyboardInterrupt):
+            return INTERRUPTED, "interrupted"  # it came inside `threading.Condition.wait`, as in `Thread.start`
         usage = getattr(error, "show", None)  # typer's error for an unknown flag or argument
         if usage is None:
             logging.getLogger(__name__).error("internal error, please report it", exc_info=True)

@@ -6,6 +6,7 @@ import getpass
 import os
 import signal
 import threading
+import time
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from pathlib import Path
@@ -86,7 +87,8 @@ def page(
             print_json({"version": 1, "url": served.url})
         else:
             aside(f"fleet: {served.url}")
-        threading.Event().wait()
+        while True:
+            time.sleep(60.0)
 
 
 def _show_answers(answers: Sequence[Result], asked: Sequence[str], json: bool) -> None:

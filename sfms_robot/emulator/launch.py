@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import os
-import queue
 import shutil
 import sys
 from collections.abc import Sequence
@@ -26,10 +25,10 @@ from sfms_robot.data import Report
 from sfms_robot.emulator.emulated_wire import EmulatedServo, Timing
 from sfms_robot.endpoint import connect
 from sfms_robot.errors import BusError, ConfigError
-from sfms_robot.processes import Child, start_thread
+from sfms_robot.processes import Child
 from sfms_robot.servo.registers import Table
 
-__all__ = ["BehindSilent", "Chain", "EmulatedServo", "Timing", "launch", "wait"]
+__all__ = ["BehindSilent", "Chain", "EmulatedServo", "Timing", "launch"]
 
 BehindSilent = Literal["chain_break", "skip"]
 Transport = Literal["pty", "tcp"]
@@ -236,19 +235,6 @@ def launch(
     if isinstance(answer, ConfigError):
         raise answer
     raise BusError(f"the emulated chain did not start (exit code {child.process.returncode})")
-
-
-def wait(chains: Sequence[Chain]) -> Chain:
-    """Block until the process of a chain ends, and return that chain."""
-    ended = queue.SimpleQueue[Chain]()
-
-    def join(chain: Chain) -> None:
-        chain.child.reader.join()
-        ended.put(chain)
-
-    for chain in chains:
-        start_thread(join, "emulator", chain)
-    return ended.get()
 
 
 def _check(servos: Sequence[EmulatedServo], maps: Sequence[FirmwareMap]) -> None:

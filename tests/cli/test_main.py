@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from functools import partial
 
 import pytest
@@ -16,7 +17,7 @@ from ended import PROGRAM
 from sfms_robot.cli import main
 from sfms_robot.errors import BusError, ConfigError, ModelError, PortError
 
-FULL = "/dev/full"
+FULL, PIPED = "/dev/full", {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
 HEAVY = {"torch", "scipy", "numpy", "matplotlib", "vtkmodules", "ruckig"}
 STARTS = """
 import sys; from sfms_robot.cli.main import main
@@ -30,8 +31,7 @@ RUN = ("run", "--fast", "--head", "interbotix_wxxms", "--duration", "0.1")
 
 def completed(*words, program=PROGRAM, **settings):
     """Run a command line in a process of its own; stdout and stderr are read where `settings` do not redirect them."""
-    settings = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE} | settings
-    return subprocess.run([*program, *words], text=True, check=False, **settings)
+    return subprocess.run([*program, *words], text=True, check=False, **(PIPED | settings))
 
 
 @pytest.fixture
@@ -94,16 +94,19 @@ def test_a_file_that_fails_is_named_by_the_flag_that_led_to_it(broken, words, pa
 
 
 def test_an_interruption_is_130_without_a_line_and_a_command_that_printed_its_end_adds_nothing(broken):
-    ended = broken(raises(KeyboardInterrupt()), "--json")
-    assert (ended.code, ended.err, ended.told["exit"]) == (130, "", "interrupted")
+    def amid_a_wait():
+        with (lock := threading.Lock()):  # as `threading.Condition.wait` does
+            lock.release()
+            raise KeyboardInterrupt
+
+    for body in (raises(KeyboardInterrupt()), amid_a_wait):
+        ended = broken(body, "--json")
+        assert (ended.code, ended.err, ended.told["exit"]) == (130, "", "interrupted")
     assert broken(raises(typer.Exit(4)), "--json") == (4, "", "") and broken(lambda: None, "--json") == (0, "", "")
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_a_signal_that_would_kill_is_an_interruption_and_its_handler_is_put_back(broken, name):
-    number = getattr(signal, name, None)
-    if number is None:
-        pytest.skip(f"no {name} here")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_that_would_kill_is_an_interruption_and_its_handler_is_put_back(broken, number):
     cleaned = []
 
     def body() -> None:

@@ -9,8 +9,9 @@ import pytest
 import serial
 from virtual_time import Time
 
+from sfms_robot.app.servo.emulated_chains import until_stopped
 from sfms_robot.app.wiring import EmulatedPort
-from sfms_robot.emulator.launch import Chain, EmulatedServo, launch, wait
+from sfms_robot.emulator.launch import Chain, EmulatedServo, launch
 from sfms_robot.errors import BusError, ConfigError, PortError
 from sfms_robot.runtime.clock import RealClock
 from sfms_robot.servo.codecs import dxl2
@@ -117,8 +118,7 @@ def test_reply_that_is_late_counts_as_silence_and_is_seen_only_after_the_next_fl
 @pytest.mark.parametrize("request_", ["inject dorp", "inject drop:9", "turn 1 x", "turn", "supply", "state 9", "dance"])
 def test_request_that_makes_no_sense_is_refused_and_harms_nothing(virtual, request_):
     chain, host = virtual()
-    with pytest.raises(BusError, match="refuses"):
-        chain.ask(request_)
+    pytest.raises(BusError, chain.ask, request_).match("refuses")
     assert host.ask(1, 2, 3) == [1, 2, 3]
 
 
@@ -157,7 +157,7 @@ def test_a_link_is_made_replaced_where_its_emulator_was_killed_and_removed(tmp_p
     assert not os.path.lexists(link)
     with launch([EmulatedServo(1)], link=str(link)) as chain:
         os.kill(chain.pid, signal.SIGKILL)
-        assert wait([chain]) is chain
+        pytest.raises(BusError, until_stopped, {"servos": chain}).match(f"the emulated chain {chain.device} has ended")
     assert not link.is_symlink()
 
 

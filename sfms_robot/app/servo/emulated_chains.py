@@ -7,22 +7,21 @@ registers, `starts` 3=4150 sets the position that a servo reports (ticks; it may
 from __future__ import annotations
 
 import re
-import signal
-import sys
+import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import Final
 
 from sfms_robot.config import load_firmware_map, load_head
 from sfms_robot.data import Report
 from sfms_robot.emulator.faults import parse_ids
-from sfms_robot.emulator.launch import BehindSilent, Chain, EmulatedServo, Timing, launch, wait
+from sfms_robot.emulator.launch import BehindSilent, Chain, EmulatedServo, Timing, launch
 from sfms_robot.endpoint import whole_number
 from sfms_robot.errors import BusError, ConfigError
 
+_POLL_S: Final = 0.2
 USUAL_BAUD: Final = 1_000_000
 _BOARD_BAUDS: Final = {"maestro": 115_200, "ssc32": 9_600}
 _MORE_IDS: Final = re.compile(r"\d+(-\d+)?")
@@ -94,15 +93,12 @@ def described(chains: Mapping[str, Chain], head: str | None) -> Report:
 
 
 def until_stopped(chains: Mapping[str, Chain]) -> None:
-    """Block until SIGTERM or SIGINT, which end the program with code 0. Raises BusError when a chain dies before."""
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        sys.exit(0)  # unwinds, so that chains and links are removed
-
-    for each in ("SIGTERM", "SIGINT", "SIGHUP"):
-        if hasattr(signal, each):  # Windows has no SIGHUP
-            signal.signal(getattr(signal, each), leave)
-    raise BusError(f"the emulated chain {wait(list(chains.values())).device} has ended")
+    """Block until Ctrl-C, SIGTERM or SIGHUP raises KeyboardInterrupt. Raises BusError when a chain dies before."""
+    while True:
+        for chain in chains.values():
+            if chain.child.process.poll() is not None:
+                raise BusError(f"the emulated chain {chain.device} has ended")
+        time.sleep(_POLL_S)  # not a lock: an exception inside `threading.Condition.wait` breaks it
 
 
 def _change(option: str, text: str, wires: Collection[list[EmulatedServo]]) -> None:
