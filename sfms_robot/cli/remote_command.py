@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import getpass
 import os
-import signal
-import threading
 import time
 from collections.abc import Sequence
 from contextlib import closing, suppress
@@ -139,9 +137,6 @@ def serve(
     from sfms_robot.app.serve.batch_process import Served
     from sfms_robot.app.serve.service import serve as serve_until
 
-    over = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: over.set())
     served = Served(
         listener=listener,
         name=name or Path(listener).name,
@@ -153,7 +148,6 @@ def serve(
     )
     figures = serve_until(
         served,
-        over,
         aside,
         router=zenoh,
         insecure=insecure,

@@ -74,7 +74,7 @@ class Readers:
     def __exit__(self, *_):
         self.over.set()
         for thread in self.threads:
-            thread.join(5)
+            thread.join(60)
         self.osc.close()
 
     def read_json(self):

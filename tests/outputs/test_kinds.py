@@ -113,7 +113,7 @@ def served(output, client):
     while not output.statistics()["clients"]:
         pass
     output.send(face(), 0.0)
-    return json.loads(client.recv(timeout=5))
+    return json.loads(client.recv(timeout=60))
 
 
 def test_a_plain_client_reads_frames_and_a_flood_is_disconnected(stream):
@@ -125,7 +125,7 @@ def test_a_plain_client_reads_frames_and_a_flood_is_disconnected(stream):
             client.send("hello")
         with pytest.raises(Exception, match=r"1008.*this server reads no messages"):
             while True:
-                client.recv(timeout=5)
+                client.recv(timeout=60)
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ class Daemon:
         """Return what the daemon answers over HTTP; None as long as it does not."""
         request = urllib.request.Request(f"http://{self.address}{path}", method=method)
         try:
-            with urllib.request.urlopen(request, timeout=5) as answer:
+            with urllib.request.urlopen(request, timeout=60) as answer:
                 return json.load(answer)
         except OSError:
             return None
@@ -74,7 +74,7 @@ class Daemon:
         found = {}
         with connect(f"ws://{self.address}/ws/sdk") as client:
             while not {"head_pose", "joint_positions"} <= set(found):
-                message = json.loads(client.recv(timeout=5))
+                message = json.loads(client.recv(timeout=60))
                 found[message["type"]] = message
         pose, joints = found["head_pose"]["head_pose"], found["joint_positions"]
         return np.array(pose), joints["head_joint_positions"][0], joints["antennas_joint_positions"]

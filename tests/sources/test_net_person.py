@@ -22,7 +22,7 @@ from sfms_robot.sources.net_person import SILENT_S, NetPerson, NetSight, NetSpee
 from sfms_robot.sources.paired import PairedSource
 from sfms_robot.sources.registry import open_source
 
-WAIT_S = 20.0  # for what is bound to come
+WAIT_S = 60.0  # for what is bound to come
 SECOND = np.full(16000, 8000, np.int16)
 
 

@@ -26,7 +26,7 @@ from sfms_robot.viewer.page_process import Address, PageProcess
 from sfms_robot.viewer.page_server import PageServer
 from sfms_robot.viewer.web_server import CONNECTION_S, STATIC, PromptConnection, web_server
 
-WAIT_S = 30.0  # for what is bound to come
+WAIT_S = 60.0  # for what is bound to come
 RARE = rare_json("listening", (), {}, None)
 HELLO = {"version": 1, "head": "face28", "joints": [], "channels": []}
 

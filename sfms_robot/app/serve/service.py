@@ -227,7 +227,6 @@ class _Worker:
 
 def serve(
     served: Served,
-    over: threading.Event,
     say: Callable[[str], None],
     *,
     router: Path | None,
@@ -235,11 +234,10 @@ def serve(
     metrics: str | None,
     processes: int | None,
 ) -> Report:
-    """Serve until `over` is set, and return the figures. Blocks until then.
+    """Serve until Ctrl-C, SIGTERM or SIGHUP raises KeyboardInterrupt, and return the figures. Blocks until then.
 
     Args:
         served: the listener, and how it is served.
-        over: ends the service.
         say: prints a line for people.
         router: zenoh's configuration; None: loopback.
         insecure: allow endpoints beyond loopback without TLS.
@@ -288,8 +286,10 @@ def serve(
             f"{DEADLINE_S * 1e3:.0f} ms, by {len(pool.capacities)} processes"
         )
         service_manager.ready(f"{name}: up to {pool.most} heads")
-        while pool.problem is None and not over.wait(service_manager.every_s):
-            service_manager.alive()
+        with suppress(KeyboardInterrupt):
+            while pool.problem is None:
+                time.sleep(service_manager.every_s)
+                service_manager.alive()
         service_manager.stopping()
         if pool.problem is not None:
             raise pool.problem
