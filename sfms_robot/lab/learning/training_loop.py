@@ -19,7 +19,6 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from types import FrameType
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -228,20 +227,20 @@ def _interruptions(patient: bool = False) -> Iterator[Callable[[], bool]]:
 
     `patient`: later ones too, since torchrun passes on those of the terminal. Signals reach the main thread only.
     """
-    pressed = threading.Event()
+    pressed = list[bool]()  # not an Event: a second signal may come while the handler of the first holds its lock
 
-    def press(number: int, frame: FrameType | None) -> None:
-        pressed.set()
+    def press(*_: object) -> None:
+        pressed.append(True)
         if not patient:
             signal.signal(signal.SIGINT, before)  # the second one has its usual effect
 
     if threading.current_thread() is not threading.main_thread():
-        yield pressed.is_set
+        yield lambda: False
         return
     before = signal.getsignal(signal.SIGINT) or signal.default_int_handler
     signal.signal(signal.SIGINT, press)
     try:
-        yield pressed.is_set
+        yield lambda: bool(pressed)
     finally:
         signal.signal(signal.SIGINT, before)
 
